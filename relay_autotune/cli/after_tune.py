@@ -170,7 +170,7 @@ class AfterTune:
             return self._nothing_started()
         if not options.json:
             paint = Paint(colour=wants_colour(sys.stdout.isatty(), os.environ))
-            left = self.left() if self._is_new else ""
+            left = self.left() if self._is_new else self.joint.left() if self.joint else ""
             lines = result_lines(result, client.cancelled, paint, width(), left)
             print("\n".join(lines), flush=True)
         flags, report = self._reported()
@@ -246,6 +246,9 @@ class AfterTune:
             told = "the --at at which it rests, a smaller --amplitude, or wider --within"
             return [("once it rests", f"start again with {told}")]
         steps = [("run it again", again)]
+        with suppress(RelayAutotuneError):
+            if self.joint is not None and (typed := self.joint.activation()):
+                return [("activate its controller", typed), *steps]
         if result.reason.startswith("no measurement on "):
             topic = result.reason.split()[3]
             told = f"the sensor (ros2 topic hz {topic}) and the load of the machine (uptime)"

@@ -56,6 +56,8 @@ from relay_autotune_msgs.action import Tune
 _JOINT_STATES = "joint_states"
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _FLOATS = "std_msgs/msg/Float64MultiArray"
+# How long to wait for a manager that may be gone [s].
+_PATIENCE = 2.0
 # Height of the trajectory that verifies gains by hand, as a part of the joint's range.
 _PROOF = 0.05
 
@@ -104,7 +106,7 @@ class JointTune:
             self._within, self._within_from = list(loop.within), "robot_description"
         if self._within is None:
             what = f"lowest and highest {loop.measured} that {loop.joint} may have [y]"
-            self._within = asked(what, "--within", "", "-5 5", pair_of)
+            self._within, self._within_from = asked(what, "--within", "", "-5 5", pair_of), "typed"
         self._baseline = loop.state.output if options.at is None else options.at
         if options.open and not math.isfinite(self._baseline):
             what = f"present {loop.commanded} of {loop.joint}, at which it rests [u]"
@@ -402,10 +404,12 @@ class JointTune:
         # It is closed with the block, however that ends.
         with ExitStack() as stack:
             if forward is not None:
-                stack.callback(self._give_references_back)
                 # Controllers that command 0 when they are switched off leave it to the next one.
                 with self._client.publishing(*self._first_command()) as command:
-                    stack.enter_context(Opened(self._manager, forward.name, self._former))
+                    opened = Opened(
+                        self._manager, forward.name, self._former, self._give_references_back
+                    )
+                    stack.enter_context(opened)
                     command()
             why_lost = self._manager.still_active(forward.name if forward else loop.controller)
 
@@ -427,11 +431,7 @@ class JointTune:
     def _give_references_back(self) -> None:
         """Publish the references of before, which the controller forgets when it is switched."""
         loop = self._loop
-        active = False
-        with suppress(LoopError):
-            listed = self._manager.controllers()
-            active = any(each.name == loop.controller and each.is_active for each in listed)
-        if loop.why_not_moved or not active:
+        if loop.why_not_moved:
             return
         reference = loop.state.reference
         commands = CommandMessage(COMMAND_TYPE, loop.reference_field, loop.references)
@@ -449,6 +449,28 @@ class JointTune:
                 f"{loop.controller} is active again, but does not take its former reference "
                 f"{reference:g} for {loop.joint}: publish it on {loop.reference_topic}",
             )
+
+    def activation(self) -> str:
+        """Return what to type so that its controller is active; empty: it is.
+
+        :raises LoopError: if the manager does not answer.
+        """
+        name = self._loop.controller
+        listed = self._manager.controllers(_PATIENCE)
+        active = any(each.name == name and each.is_active for each in listed)
+        return "" if active else self._manager.command_for([name], [])
+
+    def left(self) -> str:
+        """Return in which state the joint is."""
+        loop = self._loop
+        stays = f"{loop.joint} has the last {loop.commanded} that it got"
+        try:
+            if self.activation():
+                return f"{loop.controller} is not active: {stays}"
+        except LoopError as error:
+            return f"{error}: {stays}, or what its hardware does without a manager"
+        what = loop.why_not_moved or f"the reference of {loop.joint} is that of before"
+        return f"{loop.controller} is active, {what}"
 
     # The gains.
 

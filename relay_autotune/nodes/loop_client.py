@@ -272,13 +272,6 @@ class LoopClient:
         finally:
             self._node.destroy_publisher(mouth)
 
-    def has_publisher(self, topic: str) -> bool:
-        """Tell whether a topic has a publisher.
-
-        :param topic: its full name.
-        """
-        return self._node.count_publishers(topic) > 0
-
     def values(
         self, node: str, names: Sequence[str], patience: float = ANSWER_WITHIN
     ) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from rcl_interfaces.srv import ListParameters
 from std_msgs.msg import String
 
 from relay_autotune.errors import LoopError
-from relay_autotune.nodes.loop_client import LoopClient
+from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
 
 # How long the manager may take for one switch, and until the former controllers are active [s].
 _SWITCH_WITHIN = 5
@@ -142,12 +142,13 @@ class ControllerManager:
         """Return the full name of a node or a topic in the manager's namespace."""
         return f"{self.namespace}/{name}"
 
-    def controllers(self) -> tuple[ManagedController, ...]:
+    def controllers(self, patience: float = ANSWER_WITHIN) -> tuple[ManagedController, ...]:
         """Return the controllers that are loaded.
 
+        :param patience: how long to wait for the answer [s].
         :raises LoopError: if the manager does not answer.
         """
-        return _listed(self._ask("ListControllers").controller)
+        return _listed(self._ask("ListControllers", patience=patience).controller)
 
     def command_interfaces(self) -> tuple[str, ...]:
         """Return the names of the command interfaces that the hardware offers.
@@ -157,11 +158,17 @@ class ControllerManager:
         found = self._ask("ListHardwareInterfaces").command_interfaces
         return tuple(each.name for each in found if each.is_available)
 
-    def switch(self, activate: Iterable[str], deactivate: Iterable[str]) -> None:
+    def switch(
+        self,
+        activate: Iterable[str],
+        deactivate: Iterable[str],
+        patience: float = ANSWER_WITHIN,
+    ) -> None:
         """Switch controllers in one step of the manager, all of them or none.
 
         :param activate: their names.
         :param deactivate: likewise.
+        :param patience: how long to wait for the answer [s].
         :raises LoopError: with the manager's reason, if it refuses or does not answer.
         """
         kind = self._kinds["SwitchController"]
@@ -172,7 +179,7 @@ class ControllerManager:
             activate_asap=True,
         )
         request.timeout.sec = _SWITCH_WITHIN
-        answer = self._ask("SwitchController", request)
+        answer = self._ask("SwitchController", request, patience)
         if not answer.ok:
             # Managers of older releases give no reason.
             why = getattr(answer, "message", "") or "its log says why"
@@ -212,10 +219,10 @@ class ControllerManager:
         words += ["--activate", *activate] if activate else []
         return shlex.join([*words, *(["--deactivate", *deactivate] if deactivate else [])])
 
-    def _ask(self, kind: str, request: Any = None) -> Any:
+    def _ask(self, kind: str, request: Any = None, patience: float = ANSWER_WITHIN) -> Any:
         service = "".join(f"_{c.lower()}" if c.isupper() else c for c in kind).lstrip("_")
         asked = request if request is not None else self._kinds[kind].Request()
-        return self.client.call(self._kinds[kind], f"{self.name}/{service}", asked)
+        return self.client.call(self._kinds[kind], f"{self.name}/{service}", asked, patience)
 
 
 def _listed(found: Iterable[Any]) -> tuple[ManagedController, ...]:
@@ -316,10 +323,18 @@ class Opened:
     :param manager: the manager.
     :param forward: name of the forwarding controller.
     :param former: names of those that are switched off.
+    :param then: called when they are active again.
     """
 
-    def __init__(self, manager: ControllerManager, forward: str, former: tuple[str, ...]) -> None:
+    def __init__(
+        self,
+        manager: ControllerManager,
+        forward: str,
+        former: tuple[str, ...],
+        then: Callable[[], None],
+    ) -> None:
         self._manager, self._forward, self._former = manager, forward, former
+        self._then = then
 
     def __enter__(self) -> Opened:
         try:
@@ -349,23 +364,25 @@ class Opened:
         manager = self._manager
         deadline = time.monotonic() + _BACK_WITHIN
         problem = ""
-        while time.monotonic() < deadline:
+        while (left := deadline - time.monotonic()) > 0.0:
             try:
-                states = {each.name: each.state for each in manager.controllers()}
+                states = {each.name: each.state for each in manager.controllers(left)}
                 lacking = [name for name in self._former if states.get(name) != _ACTIVE]
                 extra = [self._forward] if states.get(self._forward) == _ACTIVE else []
                 if not lacking and not extra:
-                    return
+                    break
                 # A strict switch is refused as a whole for one that is in its state already.
-                manager.switch(lacking, extra)
+                manager.switch(lacking, extra, deadline - time.monotonic())
             except LoopError as error:
                 problem = str(error)
                 manager.client.rest(_AGAIN)
-        typed = manager.command_for(self._former, [self._forward])
-        raise LoopError(
-            f"{', '.join(self._former)} could not be activated again"
-            f"{f' ({problem})' if problem else ''}: see to the joint, then type: {typed}"
-        )
+        else:
+            typed = manager.command_for(self._former, [self._forward])
+            raise LoopError(
+                f"{', '.join(self._former)} could not be activated again"
+                f"{f' ({problem})' if problem else ''}: see to the joint, then type: {typed}"
+            )
+        self._then()
 
 
 PID_CONTROLLER = "pid_controller/PidController"
@@ -751,10 +768,10 @@ def _states(client: LoopClient, node: str, parts: _Parts) -> tuple[DofState, ...
 def _description(client: LoopClient, namespace: str) -> str:
     """Return the robot's description; empty: none is published."""
     for topic in dict.fromkeys((f"{namespace}/robot_description", "/robot_description")):
-        if client.has_publisher(topic):
-            found = client.latched(String, topic, lambda m: m.data, _DESCRIPTION_WITHIN)
-            if found is not None:
-                return str(found.data)
+        # Its publisher may be discovered after the manager.
+        found = client.latched(String, topic, lambda m: m.data, _DESCRIPTION_WITHIN)
+        if found is not None:
+            return str(found.data)
     return ""
 
 

@@ -20,12 +20,14 @@ from relay_autotune.cli.joint_tune import JointTune
 from relay_autotune.errors import LoopError
 from relay_autotune.loop import laws
 from relay_autotune.loop.gains import Controller
+from relay_autotune.nodes import ros2_control
 from relay_autotune.nodes.gains_place import controller_of, mapping_of
 from relay_autotune.nodes.ros2_control import (
     TRAJECTORY_CONTROLLER,
     ControllerManager,
     DofState,
     ManagedController,
+    Opened,
     above,
     forwarding,
     in_the_way,
@@ -225,13 +227,16 @@ class Switching:
     def __init__(self) -> None:
         self.active = {"pid"}
 
-    def controllers(self):
+    def controllers(self, patience=0.0):
         return tuple(
             replace(c, state="active" if c.name in self.active else "off") for c in LOADED
         )
 
-    def switch(self, on, off):
+    def switch(self, on, off, patience=0.0):
         self.active = self.active - set(off) | set(on)
+
+    def command_for(self, activate, deactivate):
+        return f"type {' '.join(activate)}"
 
     def still_active(self, name):
         return lambda: "" if name in self.active else f"{name} is off"
@@ -256,6 +261,49 @@ def test_controllers_are_off_until_the_relay_ends_and_no_longer(is_open: bool) -
         assert manager.active == {"pid"}
         assert why_over(Tune.Feedback.STATE_COMPLETED) == ""
     assert given == ["command", "references"] * is_open
+
+
+def test_a_joint_whose_controller_is_off_is_told_with_what_to_type() -> None:
+    class Silent(Switching):
+        def controllers(self, patience=0.0):
+            raise LoopError("it has not answered")
+
+    manager, silent = Switching(), Silent()
+    tune = SimpleNamespace(
+        _loop=SimpleNamespace(
+            joint="left", controller="pid", commanded="effort", why_not_moved=""
+        ),
+        _manager=manager,
+    )
+    tune.activation = lambda: JointTune.activation(tune)
+    assert JointTune.left(tune) == "pid is active, the reference of left is that of before"
+    assert tune.activation() == ""
+    manager.switch([], ["pid"])
+    assert JointTune.left(tune) == "pid is not active: left has the last effort that it got"
+    assert tune.activation() == "type pid"
+    tune._manager = silent
+    assert JointTune.left(tune).startswith("it has not answered: left has the last effort")
+
+
+def test_a_manager_that_is_gone_is_not_waited_for_beyond_the_time_of_the_way_back() -> None:
+    asked = []
+
+    class Gone(Switching):
+        client = SimpleNamespace(rest=lambda _: None)
+
+        def controllers(self, patience=0.0):
+            asked.append(patience)
+            # As if all of it had passed.
+            now[0] += patience
+            raise LoopError("no answer")
+
+    now = [0.0]
+    opened = Opened(Gone(), "one", ("pid",), lambda: asked.append("references"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ros2_control, "time", SimpleNamespace(monotonic=lambda: now[0]))
+        with pytest.raises(LoopError, match=r"pid could not be .* \(no answer\).* type: type pid"):
+            opened.close()
+    assert sum(asked) <= ros2_control._BACK_WITHIN
 
 
 class Arm:
@@ -301,10 +349,8 @@ class Arm:
         )
         return [message] * least
 
-    def has_publisher(self, topic):
-        return topic == "/robot_description"
-
     def latched(self, kind, topic, wanted, patience):
+        assert topic == "/robot_description" and patience > 0.0
         return SimpleNamespace(data=DESCRIPTION.replace("free", "arm_2"))
 
 
