@@ -15,11 +15,9 @@ import math
 import os
 import shlex
 import shutil
-import signal
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -43,6 +41,7 @@ from relay_autotune.cli.terminal import (
     agreed_step,
     asked,
     asked_for_file,
+    noted,
     number_of,
     tell,
     width,
@@ -57,7 +56,6 @@ from relay_autotune.cli.tune_view import (
     wants_colour,
 )
 from relay_autotune.control.verification import (
-    LEAST_OF_NOISE,
     Step,
     allowed_steps,
     noise_of,
@@ -498,11 +496,12 @@ class _Proof:
         if not step:
             raise TuningError("the limits leave no room for a step: widen --within")
         self._rate = rate_from(parameters_of_law(gains.law, gains.law_period))
-        wanted = plan(gains, model, Step(setpoint=step), record.mean_interval, rate=self._rate)
-        peak = wanted.peak / abs(step)
-        self.allowed = allowed_steps(record, model, *limits, peak, noise)
+        period, rate = record.mean_interval, self._rate
+        once = plan(gains, model, Step(setpoint=1.0), period, rate=rate)
+        self.allowed = allowed_steps(record, model, *limits, once, noise)
         self.step: float = options.step or self.allowed.nearest(step)
         self.allowed.require(self.step)
+        wanted = plan(gains, model, Step(setpoint=self.step), period, rate=rate)
         # How long the loop takes to settle with the gains, and all of it [s].
         known = math.isfinite(gains.settling_time)
         self._settles = gains.settling_time if known else wanted.duration
@@ -525,11 +524,6 @@ class _Proof:
             f"expected from {least:.3g} to {most:.3g} u, never beyond "
             f"{commands.low:g} to {commands.high:g} u. Ctrl-C ends it at once, likewise."
         )
-        if abs(self.step) < LEAST_OF_NOISE * self._noise_std:
-            told += (
-                f" The limits allow a step of {abs(self.step) / self._noise_std:.1f} times the "
-                f"noise, expected {LEAST_OF_NOISE:g}: it will prove little."
-            )
         return told + (f" The gains are doubtful: {doubt}." if doubt else "")
 
     def made(self, nodes: OwnNodes, step: float, doubtful: bool) -> Any:
@@ -567,10 +561,12 @@ class _Proof:
             try:
                 with Working(f"starting {name}"):
                     loop.find(START_WITHIN)
-                    loop.put_in_force(client.result.gains)
                 patience = max(_TIMES_SETTLING * self._settles, _REST_WITHIN)
-                with _noted() as leave:
-                    found = loop.prove(step, 0.0, self._settles, patience, shown, leave)
+                with (
+                    loop.offered(client.result.gains) as gains,
+                    noted(lambda text: say(PROGRAM, text)) as leave,
+                ):
+                    found = loop.prove(step, 0.0, patience, shown, leave, gains)
                     loop.let_settle(self._settles, shown, "the loop goes back", leave)
             finally:
                 shown.clear()
@@ -582,25 +578,3 @@ class _Proof:
                     f"program does at a limit of the command was not tried",
                 )
             return found
-
-
-@contextmanager
-def _noted() -> Iterator[Callable[[], bool]]:
-    """Only note signals in the block, and obey them after it.
-
-    An exception could be lost in a callback of rclpy.
-
-    :return: what tells whether one has come.
-    """
-    came: list[int] = []
-    before = {
-        number: signal.signal(number, lambda n, _: came.append(n))
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    }
-    try:
-        yield lambda: bool(came)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        if came:
-            raise KeyboardInterrupt if came[0] == signal.SIGINT else SystemExit(128 + came[0])

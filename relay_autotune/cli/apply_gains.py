@@ -8,7 +8,7 @@ written instead, for ros2_controllers' pid_controller or the law that they are f
 changed before you answer yes, or give --yes. The height of the step is --step, else verify_step
 of the node, else half of the swing that the tune made and at least twenty times the noise (forty
 if that is within a third of the way to a limit), as far as the limits of the node allow. If the
-step fails, the node takes the gains before back by itself.
+step fails, or its proof is cut short in any way, the node takes the gains before back by itself.
 
 Exit status: 0 the gains are in force and verified (with --file: written); 1 they are not; 2 the
 command line is wrong.
@@ -31,6 +31,7 @@ from relay_autotune.cli.terminal import (
     agrees,
     in_columns,
     labelled,
+    noted,
     width,
     write,
 )
@@ -174,12 +175,10 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
     :param client: of the controller_node, which was found.
     :param options: as the command line gives them.
     """
-    settles = 0.0
     with Working("asking for the gains"):
         present, model, noise = client.in_force(), client.model(), client.noise()
         gains, doubt = client.waiting()
     if not options.verify_only:
-        settles = gains.settling_time if math.isfinite(gains.settling_time) else 0.0
         _require_trust(doubt, options)
         if client.has(gains):
             raise TuningError("the new gains are in force already: give --verify-only for a step")
@@ -201,26 +200,28 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
         return NOTHING_FOUND
     if options.accept_doubtful:
         client.set_values(client.name, {"accept_doubtful": True})
-    if not options.verify_only:
-        client.ask("apply")
     if options.no_verify:
+        client.ask("apply")
         print(f"  {'gains':<16} in force, not verified; {PROGRAM} --verify-only makes the step")
         return DONE
     shown = StatusLine()
-    try:
-        result = client.prove(step, options.load, settles, options.wait, shown)
-    except KeyboardInterrupt:
-        shown.clear()
-        say(
-            PROGRAM,
-            f"{client.name} ends the step by itself, and its gains stay; {PROGRAM} --revert takes "
-            "back those before",
-        )
-        raise
-    finally:
-        shown.clear()
-    lines = verdict_lines(result, client.in_force(), width(), stays=options.stays, noise_std=noise)
-    print("\n".join(lines))
+    new = None if options.verify_only else gains
+    with noted(lambda text: say(PROGRAM, text)) as leave:
+        try:
+            result = client.prove(step, options.load, options.wait, shown, leave, new)
+        finally:
+            shown.clear()
+        columns = width()
+        try:
+            present = client.in_force()
+            unproven = not result.passed and new is not None and client.has(new)
+            lines = verdict_lines(
+                result, present, columns, stays=options.stays, noise_std=noise, unproven=unproven
+            )
+        except LoopError as error:
+            lines = found_lines(result, columns, noise)
+            lines += labelled("gains in force", f"not known: {error}", columns)
+        print("\n".join(lines))
     return DONE if result.passed else NOTHING_FOUND
 
 
@@ -286,6 +287,7 @@ def verdict_lines(
     *,
     stays: bool = True,
     noise_std: float = math.nan,
+    unproven: bool = False,
 ) -> list[str]:
     """Return what a verification has found, in a line for each step and three more.
 
@@ -294,14 +296,16 @@ def verdict_lines(
     :param columns: that a line may have.
     :param stays: True if the controller_node goes on running.
     :param noise_std: of the measurement [y]; NaN: not known.
+    :param unproven: True if the gains in force are new ones that have not passed.
     """
     now = "none, the command is held"
     if present is not None:
         now = ", ".join(f"{n} {digits(getattr(present, n))}" for n, _ in _FIGURES[:3])
-    after = f"; {PROGRAM} --revert takes those before" if result.passed and stays else ""
-    return found_lines(result, columns, noise_std) + labelled(
-        "gains in force", f"{now}{after}", columns
-    )
+    if result.passed and stays:
+        now += f"; {PROGRAM} --revert takes those before"
+    if unproven:
+        now += "; these are the new ones, which are not proven: set those before yourself"
+    return found_lines(result, columns, noise_std) + labelled("gains in force", now, columns)
 
 
 def found_lines(result: Any, columns: int, noise_std: float = math.nan) -> list[str]:

@@ -36,7 +36,7 @@ from relay_autotune.exchange.messages import gains_from_message, transfer_functi
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.gains_place import controller_of
 from relay_autotune.nodes.live_types import CommandMessage, message_class
-from relay_autotune.nodes.loop_client import LoopClient
+from relay_autotune.nodes.loop_client import GoneError, LoopClient
 from relay_autotune.nodes.readiness import ChecklistLine, Mark
 from relay_autotune.nodes.ros2_control import (
     COMMAND_TYPE,
@@ -519,13 +519,21 @@ class JointTune:
                 values[name] = clamp
         # Not before, since relay_node refuses a second publisher of the reference.
         nodes.start("controller_node", ros_arguments(self._space, topics, values))
-        return apply_at(
-            own_node(self._options, "controller_node"),
-            client,
-            doubtful=bool(doubt),
-            yes=self._options.yes,
-            patience=START_WITHIN,
-        )
+        try:
+            return apply_at(
+                own_node(self._options, "controller_node"),
+                client,
+                doubtful=bool(doubt),
+                yes=self._options.yes,
+                patience=START_WITHIN,
+            )
+        except GoneError:
+            # It would have taken its step back.
+            nodes.end("controller_node")
+            with suppress(LoopError):
+                if not self.activation():
+                    self._give_references_back()
+            raise
 
     def _set(self, tuned: TuneClient) -> int:
         """Set the gains of a controller whose references nobody can move; return the status."""

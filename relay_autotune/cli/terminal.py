@@ -9,16 +9,17 @@ import argparse
 import math
 import os
 import re
+import signal
 import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Collection, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from relay_autotune.errors import LoopError, SelectionError
+from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError
 from relay_autotune.text import TOLD_EVERY, duration
 
 if TYPE_CHECKING:
@@ -331,6 +332,33 @@ def agrees(question: str, *, yes: bool) -> bool:
         return True
     _require_somebody("--yes")
     return _input(f"\n{question} [y/N] ").lower() in ("y", "yes")
+
+
+@contextmanager
+def noted(tell: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
+    """Only note signals in the block, and obey them after it.
+
+    An exception could be lost in a callback of rclpy.
+
+    :param tell: called with the error with which the block ends after a signal.
+    :return: what tells whether one has come.
+    """
+    came: list[int] = []
+    before = {
+        number: signal.signal(number, lambda n, _: came.append(n))
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    }
+    try:
+        yield lambda: bool(came)
+    except RelayAutotuneError as error:
+        if not came:
+            raise
+        tell(str(error))
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if came:
+            raise KeyboardInterrupt if came[0] == signal.SIGINT else SystemExit(128 + came[0])
 
 
 def agreed_step(question: str, step: float, allowed: StepRange) -> float:

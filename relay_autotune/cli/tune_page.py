@@ -435,26 +435,24 @@ class GainsPage:
             live.tell(phase="applying", tone="", status="bringing back the gains before", proof=())
             live.rest(controller.ask("revert"), good=True)
             return
-        settles = 0.0
         with controller.accepting_doubtful() if wish.doubtful else nullcontext():
             if wish.what == APPLY:
                 live.tell(phase="applying", tone="", status="putting the gains in force", proof=())
-                message, settles = self._message(wish)
-                if wish.step:
-                    tried = gains_from_message(message)
-                    controller.allowed_steps(tried).require(wish.step)
-                told = controller.put_in_force(message)
-                live.tell(status=told)
-                self.look()
-            elif (present := controller.in_force()) is not None:
+                message = self._message(wish)
+                if not wish.step:
+                    told = controller.put_in_force(message)
+                    live.rest(f"{told}; they are not verified", good=True)
+                    return
+                controller.allowed_steps(gains_from_message(message)).require(wish.step)
+                with controller.offered(message) as gains:
+                    self._verify(wish, controller, gains)
+                return
+            if (present := controller.in_force()) is not None:
                 controller.allowed_steps(present).require(wish.step)
-            if wish.step:
-                self._verify(wish, controller, settles)
-            else:
-                live.rest(f"{told}; they are not verified", good=True)
+            self._verify(wish, controller, None)
 
-    def _message(self, wish: Wish) -> tuple[Any, float]:
-        """Return the gains that the page shows as a message, and how long they take to settle."""
+    def _message(self, wish: Wish) -> Any:
+        """Return the gains that the page shows as a message."""
         if wish.asked is None or not 0 <= wish.of < len(self.page.subjects):
             raise TuningError("there are no such gains")
         subject: Subject = self.page.subjects[wish.of]
@@ -466,14 +464,14 @@ class GainsPage:
             raise TuningError(f"the gains are doubtful, and were not accepted: {judgement.reason}")
         message = PidGains()
         fill_gains(message, gains, experiment_id=subject.case.experiment_id, judgement=judgement)
-        return message, gains.settling_time if math.isfinite(gains.settling_time) else 0.0
+        return message
 
-    def _verify(self, wish: Wish, controller: GainsClient, settles: float) -> None:
+    def _verify(self, wish: Wish, controller: GainsClient, new: Controller | None) -> None:
         live = self.live
         live.tell(phase="verifying", tone="warn", proof=())
         live.show("proof", [])
         result = controller.prove(
-            wish.step, 0.0, settles, _REST_WITHIN, lambda text: live.tell(status=text), self.leave
+            wish.step, 0.0, _REST_WITHIN, lambda text: live.tell(status=text), self.leave, new
         )
         live.show("proof", [_document(step) for step in controller.steps_of(result)])
         present = controller.in_force()

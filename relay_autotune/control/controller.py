@@ -128,6 +128,11 @@ class PidController:
         """True if it controls, False if it holds its command."""
         return self._automatic and self.gains is not None
 
+    @property
+    def is_manual(self) -> bool:
+        """True if it was switched to manual."""
+        return not self._automatic
+
     def use(self, gains: Controller | None) -> None:
         """Change the gains without a bump.
 

@@ -8,7 +8,9 @@ guarantees:
 
 - gains that failed a verification are never in force again;
 - a revert leads to a whole set that was in force, never to half of a change;
-- after an interruption the newest trusted gains are in force: proven ones, or those of the
+- a proof that has begun ends with :meth:`GainsHistory.passed`, :meth:`GainsHistory.fail` or
+  :meth:`GainsHistory.cut_short`, and only the first leaves unproven gains in force;
+- after a restart the newest trusted gains are in force: proven ones, or those of the
   configuration.
 """
 
@@ -21,9 +23,9 @@ from enum import Enum
 
 from relay_autotune.errors import TuningError
 
-# Number of earlier sets, and of failed sets, that are kept.
-_KEPT = 20
-_KNOWN = 1000
+# Number of earlier sets, and of failed and of doubtful sets, that are kept.
+KEPT = 20
+KNOWN = 1000
 # Why no change of the gains may begin now.
 AT_WORK = "gains are being put in force; wait for the end of that"
 # Numbers with a smaller relative difference are equal.
@@ -129,7 +131,7 @@ class GainsHistory:
     :param in_force: the present gains; None: the command is held.
     :param before: earlier gains in force, without failed ones, the newest last.
     :param failed: gains that failed a verification.
-    :param doubtful: gains whose verification was interrupted by the end of the process.
+    :param doubtful: gains whose verification was cut short.
     :param work: the operation in progress.
     """
 
@@ -171,7 +173,7 @@ class GainsHistory:
         self._require_rest()
         self.require_not_failed(gains)
         if self.in_force is not None and gains == self.in_force.gains:
-            return replace(self, in_force=self.in_force.whole(), work=Work.APPLY)
+            return replace(self, in_force=self.in_force.whole())
         return replace(self._with(Entry(gains, Standing.APPLIED)), work=Work.APPLY)
 
     def edit(self, gains: GainSet | None) -> GainsHistory:
@@ -192,11 +194,11 @@ class GainsHistory:
         """Take the gains found in another node, whoever set them."""
         if self.in_force is not None and gains.is_near(self.in_force.gains):
             return self
-        standing = Standing.APPLIED if gains in self.failed else Standing.GIVEN
+        standing = Standing.GIVEN if self.is_open_to(gains) else Standing.APPLIED
         return self._with(Entry(gains, standing))
 
     def settled(self) -> GainsHistory:
-        """Return the history after the operation has ended without a verdict."""
+        """Return the history after the change is done."""
         return replace(self, work=Work.NOTHING)
 
     # Going back.
@@ -214,15 +216,17 @@ class GainsHistory:
 
     # Proof.
 
-    def verify(self) -> GainsHistory:
-        """Begin to verify the gains in force.
+    def verify(self, gains: GainSet | None = None) -> GainsHistory:
+        """Begin to verify gains.
 
-        :raises HistoryError: if no gains are in force, or another operation is in progress.
+        :param gains: a whole set that is put in force for it; None: the gains in force.
+        :raises HistoryError: as :meth:`apply`, or if no gains are in force.
         """
         self._require_rest()
-        if self.in_force is None:
+        state = self if gains is None else self.apply(gains)
+        if state.in_force is None:
             raise HistoryError("there are no gains to verify")
-        return replace(self, in_force=self.in_force.whole(), work=Work.VERIFY)
+        return replace(state, in_force=state.in_force.whole(), work=Work.VERIFY)
 
     def passed(self) -> GainsHistory:
         """Return the history after the gains in force have passed."""
@@ -242,28 +246,48 @@ class GainsHistory:
         state = replace(
             self,
             before=tuple(entry for entry in self.before if entry.gains != gains),
-            failed=(*(g for g in self.failed if g != gains), gains)[-_KNOWN:],
+            failed=(*(g for g in self.failed if g != gains), gains)[-KNOWN:],
         )
         return state._back().settled()
 
-    # After an interruption.
+    def cut_short(self) -> GainsHistory:
+        """Return the history after the operation in progress has ended in any other way.
+
+        Trusted gains stay; others go back to those before them, or to none.
+        """
+        entry, state = self.in_force, self
+        if self.work is Work.NOTHING:
+            return self
+        if entry is not None and entry.is_trusted:
+            return self.settled()
+        if self.work is Work.VERIFY and entry is not None:
+            known = (*(g for g in self.doubtful if g != entry.gains), entry.gains)[-KNOWN:]
+            state = replace(self, doubtful=known)
+        return state._back().settled()
 
     def is_open_to(self, gains: GainSet) -> bool:
         """Return True if gains may be applied automatically."""
         return gains not in self.failed and gains not in self.doubtful
 
-    def after_interruption(self) -> GainsHistory:
-        """Return the history after the process ended, while the gains stayed in the other node.
+    # After a restart.
 
-        Completed operations stay; an operation in progress is undone.
+    def within(self, allows: Callable[[GainSet], bool], *, present: bool = False) -> GainsHistory:
+        """Return the history without the gains that must not come back.
+
+        :param allows: tells whether gains may be in force.
+        :param present: True: also without those in force.
         """
-        if self.work is Work.NOTHING:
-            return self
-        state, entry = self, self.in_force
-        if self.work is Work.VERIFY and entry is not None and not entry.is_trusted:
-            known = (*(g for g in self.doubtful if g != entry.gains), entry.gains)[-_KNOWN:]
-            state = replace(self, doubtful=known)
-        return state._trusted().settled()
+        failed = frozenset(self.failed)
+
+        def fits(entry: Entry) -> bool:
+            return entry.gains not in failed and allows(entry.gains)
+
+        stays = self.in_force is not None and (not present or fits(self.in_force))
+        return replace(
+            self,
+            in_force=self.in_force if stays else None,
+            before=tuple(entry for entry in self.before if fits(entry)),
+        )
 
     def after_restart(self, given: GainSet | None) -> GainsHistory:
         """Return the history of a controller that restarts with no gains in force yet.
@@ -271,8 +295,8 @@ class GainsHistory:
         :param given: gains of its configuration; if the configuration has changed, they take
             precedence over proven gains, unless they failed.
         """
-        state = self.after_interruption()._trusted()
-        if given == self.given:
+        state = self.cut_short()._trusted()
+        if given == self.given and state.in_force is not None:
             return state
         state = replace(state, given=given)
         if given is None:
@@ -295,7 +319,7 @@ class GainsHistory:
         before = self.before
         if old is not None and not half and old.gains not in self.failed:
             before = (*before, old.whole())
-        if len(before) > _KEPT:
+        if len(before) > KEPT:
             # Drop the oldest, but keep the newest trusted set.
             trusted = max((k for k, e in enumerate(before) if e.is_trusted), default=-1)
             drop = 1 if trusted == 0 else 0

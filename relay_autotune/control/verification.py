@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize_scalar
+from scipy.special import ndtr
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.control.controller import run_loop, scaled
@@ -50,8 +51,6 @@ NARROWLY = "narrowly: "
 _OF_SWING = 0.5
 _OF_NOISE = 20.0
 _CLEAR_OF_NOISE, _OF_WIDE_ROOM = 40.0, 1.0 / 3.0
-# With a step of fewer standard deviations of the noise, the comparison is loose.
-LEAST_OF_NOISE = 10.0
 # Part of the way to a limit that a step may go, for its overshoot.
 _OF_ROOM = 0.8
 
@@ -59,6 +58,12 @@ _OF_ROOM = 0.8
 _SLOWER_SENSOR = 1.2
 
 _GAIN_SEARCH = (0.3, 3.0)
+# The least step: change of the gain for a derivative; nodes of the mean over the noise; noise as a
+# part of the step, and how often its range, and that of the gain, is halved.
+_SLIGHTLY = 1.01
+_NODES = 20
+_NOISE_SEARCH = (1e-6, 1e2)
+_HALVINGS, _MS_HALVINGS = 30, 8
 _PREDICTED_SAMPLES = 4000
 _DOUBLINGS = 8
 
@@ -81,34 +86,38 @@ class StepRange:
 
     :param low: lowest step [y].
     :param high: highest one [y].
+    :param least: smallest magnitude with which the noise does not decide [y].
     """
 
     low: float = -math.inf
     high: float = math.inf
+    least: float = 0.0
 
     @property
     def words(self) -> str:
         """Which steps are allowed, and why."""
-        if not math.isfinite(self.high - self.low):
-            return "other than 0"
-        return (
-            f"from {self.low:g} to {self.high:g} y: the limits allow no more, with the overshoot "
-            f"that the model predicts"
-        )
+        said = "other than 0"
+        if math.isfinite(self.high - self.low):
+            said = (
+                f"from {self.low:g} to {self.high:g} y: the limits allow no more, with the "
+                f"overshoot that the model predicts"
+            )
+        return said + (f"; {_least_text(self.least, 'y')}" if self.least > 0.0 else "")
 
     def allows(self, step: float) -> bool:
         """Return whether a step is within the range, and not 0.
 
         :param step: y.
         """
-        return step != 0.0 and self.low <= step <= self.high
+        return step != 0.0 and self.low <= step <= self.high and abs(step) >= self.least
 
     def nearest(self, step: float) -> float:
-        """Return the step in the range that is nearest to one [y].
+        """Return the step that the limits allow and that is nearest to one [y].
 
         :param step: y.
         """
-        return min(max(step, self.low), self.high)
+        visible = math.copysign(max(abs(step), self.least), step)
+        return min(max(visible, self.low), self.high)
 
     def require(self, step: float) -> None:
         """Refuse a step.
@@ -172,12 +181,30 @@ class Plan:
     :param peak: largest deviation of the measurement that the model predicts [y].
     :param command: predicted range of the command with the step and back without it, relative to
         rest [u].
+    :param visible: least height of a step [y, of a load u] with noise of standard deviation 1.
     """
 
     duration: float
     runaway: float
     peak: float
     command: tuple[float, float]
+    visible: float
+
+    def require_visible(self, step: Step, noise_std: float) -> None:
+        """Refuse a step that cannot be judged.
+
+        :param step: the step.
+        :param noise_std: standard deviation of the measurement noise [y].
+        :raises TuningError: with the least step.
+        """
+        height, unit = (step.setpoint, "y") if step.setpoint else (step.load, "u")
+        least = rounded_up(self.visible * noise_std)
+        if abs(height) < least:
+            raise TuningError(f"the step is {height:g} {unit}: {_least_text(least, unit)}")
+
+
+def _least_text(least: float, unit: str) -> str:
+    return f"with the noise of the measurement, less than {least:g} {unit} cannot be judged"
 
 
 def noise_of(noise_std: float, residual_rms: float) -> float:
@@ -222,10 +249,10 @@ def allowed_steps(
     model: TransferFunction,
     measurement: Limits,
     command: Limits,
-    peak: float,
+    wanted: Plan,
     noise_std: float,
 ) -> StepRange:
-    """Return the steps of the set-point that limits allow, in two digits.
+    """Return the steps of the set-point that limits allow and noise does not hide, in two digits.
 
     The predicted peak, with an allowance for the noise, stays within the limits of the
     measurement, and the command can hold the new set-point.
@@ -234,16 +261,18 @@ def allowed_steps(
     :param model: the process.
     :param measurement: its range [y].
     :param command: its range [u].
-    :param peak: largest predicted deviation of the measurement, for a step of 1.
+    :param wanted: for a step of the set-point by 1.
     :param noise_std: of :func:`noise_of` [y].
     """
     assert record.settings is not None
-    setpoint = record.settings.setpoint
-    spared = NOISE_ALLOWANCE * (0.0 if math.isnan(noise_std) else noise_std)
+    setpoint, peak = record.settings.setpoint, wanted.peak
+    noise = 0.0 if math.isnan(noise_std) else noise_std
+    spared = NOISE_ALLOWANCE * noise
     down, up = _ways(record, model, measurement, command)
     return StepRange(
         0.0 - _rounded_down(min(down, (setpoint - measurement.low - spared) / peak)),
         _rounded_down(min(up, (measurement.high - setpoint - spared) / peak)),
+        rounded_up(wanted.visible * noise),
     )
 
 
@@ -270,6 +299,14 @@ def _rounded_down(value: float) -> float:
         return max(value, 0.0)
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)
     return float(f"{math.floor(value / unit * (1.0 + 1e-9)) * unit:.2g}")
+
+
+def rounded_up(value: float) -> float:
+    """Return a number in two digits that is at least a value, 0 for 0."""
+    if not 0.0 < value < math.inf:
+        return value
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{math.ceil(value / unit * (1.0 - 1e-9)) * unit:.2g}")
 
 
 def plan(
@@ -313,9 +350,106 @@ def plan(
             runaway = RUNAWAY * response.largest + 10.0 * noise_std
             low, high, last = run.command.min(), run.command.max(), run.command[-1]
             command = float(min(low, last - high, 0.0)), float(max(high, last - low, 0.0))
-            return Plan(duration, runaway, response.largest, command)
+            watched = time[time <= duration]
+            visible = _visible(gains, model, step, watched, period, run.measurement, rate)
+            return Plan(duration, runaway, response.largest, command, visible)
         horizon *= 2.0
     raise TuningError("the predicted response does not settle in any reasonable time")
+
+
+def _visible(
+    gains: Controller,
+    model: TransferFunction,
+    step: Step,
+    time: FloatArray,
+    period: float,
+    predicted: FloatArray,
+    rate: LawRate | None,
+) -> float:
+    """Return the least height of a step with noise of standard deviation 1 [y, of a load u].
+
+    A loop that does what is predicted then fails by the noise as rarely as a normal value leaves
+    `NOISE_ALLOWANCE` standard deviations. The chances of :func:`_comparisons` are added, for white
+    noise: that a sample is beyond the largest overshoot; that one is outside of the band when it
+    should have settled; that the sum of absolute errors, or the fitted gain, is beyond its limit,
+    to which also belongs the gain that makes Ms too large.
+
+    :param gains: the controller.
+    :param model: the process.
+    :param step: the step.
+    :param time: instants of the prediction until the end of the step [s], shape (n,).
+    :param period: sample period of the loop [s].
+    :param predicted: deviation of the measurement [y], at these instants at least.
+    :param rate: the law that runs the gains; None: our own.
+    """
+    deviation = predicted[: time.size]
+    expected = describe(time, deviation, step)
+    scale = abs(step.setpoint) or expected.largest
+    other = run_loop(
+        gains, scaled(model, _SLIGHTLY), time, setpoint=step.setpoint, load=step.load, rate=rate
+    ).measurement
+    slope = float(np.sum(((other - deviation) / math.log(_SLIGHTLY) / scale) ** 2))
+    interval = float(np.median(np.diff(time)))
+    # Samples for each instant of the prediction.
+    each = max(interval / period, 1.0)
+    error = (step.setpoint - deviation) / scale
+    if step.setpoint:
+        beyond = -error
+    else:
+        side = 1.0 if deviation.max() >= -deviation.min() else -1.0
+        beyond = side * error
+    limit = SETTLING_RATIO * expected.settling_time + 2.0 * period
+    late = (time + interval > limit) | (time >= time[-1] - interval)
+    edges = [_edge(gains, model, math.log(end), rate) for end in GAIN_RANGE]
+    nodes, weights = np.polynomial.hermite_e.hermegauss(_NODES)
+    weights = weights / weights.sum()
+    floor = math.sqrt(2.0 / math.pi)
+
+    def chance(ratio: float) -> float:
+        """Return the chance for a noise of some part of the step."""
+        above = (expected.overshoot + OVERSHOOT_MARGIN - beyond) / ratio + NOISE_ALLOWANCE
+        band = SETTLED / ratio + NOISE_ALLOWANCE
+        settled = error[late] / ratio
+        outside = ndtr(-band + settled) + ndtr(-band - settled)
+        seen = np.maximum(np.abs(error[:, None] + ratio * nodes) - floor * ratio, 0.0)
+        mean = seen @ weights
+        spread = math.sqrt(float(np.sum(seen**2 @ weights - mean**2)) / each)
+        room = IAE_RATIO * expected.iae / scale / interval - float(mean.sum())
+        # A gain is seen with this standard deviation of its logarithm.
+        unsure = ratio / math.sqrt(max(slope * each, 1e-300))
+        rare = [room / spread, *(edge / unsure for edge in edges)]
+        return float(each * (ndtr(-above).sum() + outside.sum()) + ndtr(-np.array(rare)).sum())
+
+    allowed = 2.0 * float(ndtr(-NOISE_ALLOWANCE))
+    low, high = (math.log(end) for end in _NOISE_SEARCH)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if chance(math.exp(middle)) < allowed else (low, middle)
+    # A step of this height has a response of the size of `scale`.
+    height = abs(step.setpoint or step.load)
+    return height / (scale * math.exp(low))
+
+
+def _edge(gains: Controller, model: TransferFunction, end: float, rate: LawRate | None) -> float:
+    """Return how far the logarithm of the process gain may go to an end until Ms is too large.
+
+    :param gains: the controller.
+    :param model: the process.
+    :param end: where the gain is itself too far from the model's.
+    :param rate: the law that runs the gains; None: our own.
+    """
+    most = MS_RATIO * _ms(gains, model, rate)
+
+    def is_within(part: float) -> bool:
+        return _ms(gains, scaled(model, math.exp(part * end)), rate) <= most
+
+    low, high = 0.0, 1.0
+    if is_within(high):
+        return abs(end)
+    for _ in range(_MS_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if is_within(middle) else (low, middle)
+    return low * abs(end)
 
 
 def describe(

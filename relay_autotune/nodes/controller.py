@@ -80,6 +80,8 @@ class ControllerNode(ServedNode):
         # Why the waiting gains are doubtful; empty: they are trusted.
         self._doubt = ""
         self._applying = False
+        # The last that were applied or tried.
+        self._offered: tuple[str, Gains] | None = None
         self._predictors = Predictors(self._results.models)
         self._pid = running(
             self._rate,
@@ -106,6 +108,7 @@ class ControllerNode(ServedNode):
         self._verifier = Verifier(
             self,
             prepare=self._prepare_verification,
+            begin=lambda tried: self._keeper.begin_verification(tried.new),
             move=self._move,
             ended=self._after_verification,
         )
@@ -154,7 +157,7 @@ class ControllerNode(ServedNode):
             " ".join(filter(None, (measurement.topic_name, values["apply_to"], under))),
         )
         given = self._own(gains) if self._remote is None else None
-        self._keeper = GainsKeeper(self, self._place, journal, given)
+        self._keeper = GainsKeeper(self, self._place, journal, given, self._require_bounds)
         if self._remote is None and self._keeper.history.gains != given:
             self._use(self._keeper.history.gains)
             self.get_logger().warning(
@@ -351,12 +354,16 @@ class ControllerNode(ServedNode):
         finally:
             self._applying = False
 
-    async def _apply(self) -> str:
+    def _acceptable(self) -> tuple[str, Gains]:
+        """Return the gains that wait, with the id of their experiment.
+
+        :raises RelayAutotuneError: if there are none, or they may not be applied.
+        """
         if self._pending is None:
             raise TuningError(
                 f"{tables.NONE_WAIT}; {self._refused}" if self._refused else tables.NONE_WAIT
             )
-        name, gains = pending = self._pending
+        name, gains = self._pending
         try:
             # The record may have come after the gains.
             self._results.check(name, gains)
@@ -366,12 +373,20 @@ class ControllerNode(ServedNode):
                     f"they are {self._doubt}; set the parameter accept_doubtful to true to have "
                     "them all the same"
                 )
+        except RelayAutotuneError as error:
+            raise _not_in_force(name, error) from error
+        self._offered = self._pending
+        self._predictors.applied(self._place.set_of(gains), name)
+        return self._pending
+
+    async def _apply(self) -> str:
+        name, gains = offered = self._acceptable()
+        try:
             done = await self._keeper.apply(self._place.set_of(gains))
         except RelayAutotuneError as error:
-            raise TuningError(f"the gains of {name} are not in force: {error}") from error
-        self._predictors.applied(self._place.set_of(gains), name)
+            raise _not_in_force(name, error) from error
         # Newer gains may have arrived meanwhile.
-        if self._pending is pending:
+        if self._pending is offered:
             self._pending = None
         return f"gains of {name}: {done}; ~/revert brings back those before"
 
@@ -409,10 +424,13 @@ class ControllerNode(ServedNode):
             raise NotReadyError(f"nobody subscribes to {self._commands.topic_name}")
         if self._remote is not None:
             self._remote.require_ready()
-            kept = await self._place.read()
-        else:
-            kept = self._keeper.history.gains
-        if kept is None or (self._remote is None and not self._pid.is_automatic):
+        new, settles = None, math.nan
+        if request.apply:
+            name, gains = self._acceptable()
+            new, settles = self._place.set_of(gains), gains.settling_time
+            self._predictors.applied(new, name)
+        kept = new or await self._place.read() or self._keeper.history.gains
+        if kept is None or (self._remote is None and self._pid.is_manual):
             raise NotReadyError("the controller is not in automatic, or has no gains")
         model, doubt = self._predictors.of(kept)
         if doubt and not self.get_parameter("accept_doubtful").value:
@@ -420,9 +438,9 @@ class ControllerNode(ServedNode):
                 f"the model that would predict the step is {doubt}; set the parameter "
                 "accept_doubtful to true to step all the same"
             )
-        gains, steps = self._place.controller_of(kept), self._steps_of(request)
-        await self._keeper.begin_verification()
-        return Verifiable(steps, gains, model, self._settings.limits, self._rate)
+        steps, limits = self._steps_of(request), self._settings.limits
+        controller = self._place.controller_of(kept)
+        return Verifiable(steps, new, settles, controller, model, limits, self._rate)
 
     def _steps_of(self, request: Verify.Goal) -> list[Step]:
         height = request.setpoint_step or self.get_parameter("verify_step").value
@@ -464,11 +482,18 @@ class ControllerNode(ServedNode):
         self._offset, self._load = setpoint, load
 
     async def _after_verification(self, passed: bool | None, reason: str) -> str:
-        if self._ending:
-            return reason
         reason += await self._keeper.end_verification(passed)
         verdict = "ended without a verdict" if passed is None else "passed" if passed else "failed"
         self.get_logger().info(f"verification {verdict}: {reason}")
+        offered, history = self._offered, self._keeper.history
+        if offered is not None:
+            tried = self._place.set_of(offered[1])
+            known = tried == history.gains or tried in history.failed
+            if known and self._pending is offered:
+                self._pending = None
+            elif not known and self._pending is None and not history.is_open_to(tried):
+                # They were taken back, and may be tried again.
+                self._pending = offered
         return reason
 
     # The end.
@@ -493,10 +518,12 @@ class ControllerNode(ServedNode):
             self._undo()
 
     def _undo(self) -> None:
-        """Restore another node's gains if a trial is running, and end the verification."""
-        undone = self.executor.create_task(self._keeper.abandon)
+        """End the verification, which takes its gains back, or undo a change of another node."""
         deadline = time.monotonic() + END_WITHIN
-        while time.monotonic() < deadline and (self._verifier.is_running or not undone.done()):
+        while time.monotonic() < deadline and self._verifier.is_running:
+            self.executor.turn(0.02)
+        undone = self.executor.create_task(self._keeper.abandon)
+        while time.monotonic() < deadline and not undone.done():
             self.executor.turn(0.02)
         # Give the action's client its result.
         for _ in range(20):
@@ -508,6 +535,10 @@ class ControllerNode(ServedNode):
         """Return the gains of the parameters as the history keeps them."""
         return None if gains is None else self._place.set_of(gains)
 
+    def _require_bounds(self, gains: GainSet) -> None:
+        """Refuse gains that the present parameters do not allow."""
+        self._settings.bounds.require(self._place.controller_of(gains))
+
     def _require_settable(self, changes: list[Parameter]) -> None:
         if self._following:
             return
@@ -516,7 +547,7 @@ class ControllerNode(ServedNode):
         values = merged(self, (*tables.GAINS, *tables.OTHERS), changes)
         gains = tables.settings_from(values, self._rate).gains
         if self._remote is None and {change.name for change in changes} & NAMES_OF_GAINS:
-            self._keeper.require_editable(self._own(gains))
+            self._keeper.edit(self._own(gains))
 
     def _after_set(self, changes: list[Parameter]) -> None:
         if self._following:
@@ -525,8 +556,11 @@ class ControllerNode(ServedNode):
         self._settings = tables.settings_from(values, self._rate)
         if {change.name for change in changes} & NAMES_OF_GAINS and self._remote is None:
             self._pid.use(self._settings.gains)
-            self._keeper.edited(self._own(self._settings.gains))
         self._pid.limit(self._settings.limits)
+
+
+def _not_in_force(name: str, error: RelayAutotuneError) -> TuningError:
+    return TuningError(f"the gains of {name} are not in force: {error}")
 
 
 def main(args: list[str] | None = None) -> int:

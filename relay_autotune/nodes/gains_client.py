@@ -17,6 +17,7 @@ from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
 from relay_autotune.control import verification
+from relay_autotune.control.gains_history import AT_WORK
 from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import (
     gains_from_message,
@@ -27,7 +28,7 @@ from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.gains_place import controller_of, mapping_of
-from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
+from relay_autotune.nodes.loop_client import ANSWER_WITHIN, GoneError, LoopClient
 from relay_autotune.nodes.tables import FIXED, GAINS, NONE_WAIT, rate_from
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
@@ -43,8 +44,6 @@ _TURN = 0.1
 LIMITS = ("measurement_min", "measurement_max", "command_min", "command_max")
 # Relative difference of equal gains, since another node may round them.
 _SAME = 1e-9
-# Beginning of the refusal of ~/verify that time cures.
-_NOT_AT_REST = "the loop is not at rest"
 # Parts of the refusals of a node that has just started, until it has found the others.
 _NOT_YET = (
     "is not there, or has no parameter services",
@@ -53,6 +52,8 @@ _NOT_YET = (
     "has been heard",
     "have come with a command",
     "nobody subscribes to",
+    NONE_WAIT,
+    AT_WORK,
 )
 
 
@@ -189,13 +190,14 @@ class GainsClient(LoopClient):
             for name in ("kc", "ti", "td", *others)
         )
 
-    def put_in_force(self, message: Any) -> str:
-        """Offer gains as identifier_node does, apply them, and return the answer of ~/apply.
+    @contextmanager
+    def offered(self, message: Any) -> Iterator[Gains]:
+        """Offer gains as identifier_node does until the end of the block, and return them.
 
         The gains that waited before are discarded, so that no others can be applied.
 
         :param message: the `PidGains`.
-        :raises LoopError: with the reason, if they are refused.
+        :raises LoopError: if they are in force already.
         """
         gains = gains_from_message(message)
         if self.has(gains):
@@ -204,10 +206,19 @@ class GainsClient(LoopClient):
         offer = self._node.create_publisher(PidGains, self._resolved("pi_gains"), quality.RESULT)
         try:
             offer.publish(message)
-            # auto_apply may be faster.
-            return self.ask("apply", lambda: "the gains are in force" * self.has(gains))
+            yield gains
         finally:
             self._node.destroy_publisher(offer)
+
+    def put_in_force(self, message: Any) -> str:
+        """Offer gains, apply them, and return the answer of ~/apply.
+
+        :param message: the `PidGains`.
+        :raises LoopError: with the reason, if they are refused.
+        """
+        with self.offered(message) as gains:
+            # auto_apply may be faster.
+            return self.ask("apply", lambda: "the gains are in force" * self.has(gains))
 
     @contextmanager
     def accepting_doubtful(self) -> Iterator[None]:
@@ -247,10 +258,10 @@ class GainsClient(LoopClient):
         names = ("law", "law_period", "apply_to")
         rate = rate_from(self.values(self.name, names))
         model = self.model()
-        peak = verification.plan(
+        wanted = verification.plan(
             gains, model, verification.Step(setpoint=1.0), record.mean_interval, rate=rate
-        ).peak
-        return verification.allowed_steps(record, model, *self._limits(), peak, self.noise())
+        )
+        return verification.allowed_steps(record, model, *self._limits(), wanted, self.noise())
 
     def _limits(self) -> tuple[Limits, Limits]:
         """Return the ranges of measurement and command."""
@@ -268,32 +279,71 @@ class GainsClient(LoopClient):
         self,
         setpoint: float,
         load: float,
-        settles: float,
         patience: float,
         tell: Callable[[str], None],
         leave: Callable[[], bool] = lambda: False,
+        new: Controller | None = None,
     ) -> Any:
         """Verify with a step that the user has agreed to, whatever the node allows otherwise.
 
+        New gains are put in force for it, and the node takes them back however the proof ends,
+        unless they pass; this client does it where the node is gone.
+
         :param setpoint: step of the set-point [y]; 0: that of the node's parameter.
         :param load: step of the load [u]; 0: none.
-        :param settles: how long the loop takes to settle with gains that were just applied [s].
-        :param patience: how long to wait then until the loop is at rest [s].
+        :param patience: how long to wait until the loop is at rest [s].
         :param tell: called at least each second with what is waited for.
         :param leave: returns True to end the verification without a verdict.
+        :param new: the gains that wait, if they are to be put in force; None: those in force are
+            tried.
         :return: the `Verify.Result`.
         :raises LoopError: with the reason, if there is no verdict.
         """
         before = self.values(self.name, ("verify_step", "verify_step_max"))
         more = abs(setpoint) > max(map(abs, before.values()))
+        there = self._there()
+        goal = Verify.Goal(setpoint_step=setpoint, load_step=load, patience=patience)
         if more:
             self.set_values(self.name, {"verify_step_max": abs(setpoint)})
         try:
-            self.let_settle(settles, tell, leave=leave)
-            return self._verified(setpoint, load, patience, tell, leave)
+            result = self._verified(goal, new, tell, leave)
+        except GoneError as error:
+            raise GoneError(f"{error}; {self._taken_back(*there)}") from error
         finally:
             if more:
-                self.set_values(self.name, {"verify_step_max": before["verify_step_max"]})
+                with suppress(LoopError):
+                    self.set_values(self.name, {"verify_step_max": before["verify_step_max"]})
+        return result
+
+    def _there(self) -> tuple[str, dict[str, float]]:
+        """Return the other node that has the gains, and its parameters; empty: there is none."""
+        names = ("apply_to", "apply_parameters")
+        target, mapping = self.values(self.name, names).values()
+        return target, self.values(target, list(mapping_of(mapping).values())) if target else {}
+
+    def _taken_back(self, target: str, before: dict[str, float]) -> str:
+        """Bring back the gains of another node, whose controller_node is gone, and say so.
+
+        :param target: the other node; empty: there is none.
+        :param before: its parameters.
+        """
+        # Who is lost is no reason any longer to leave the rest undone.
+        self.why_lost = lambda: ""
+        if not target:
+            return (
+                "nobody controls the loop; started again, it begins with the gains that were "
+                "proven, or with those of its parameters"
+            )
+        told = ", ".join(f"{name} {value:.6g}" for name, value in before.items())
+        with suppress(LoopError):
+            if self.values(target, list(before)) != before:
+                self.set_values(target, before)
+            if self.values(target, list(before)) == before:
+                return f"{target} has {told}, as before; its set-point may still be moved"
+        return (
+            f"{target} may have the new gains, which are not proven: start {self.name} again, "
+            f"which brings {told} back"
+        )
 
     def steps_of(self, result: Any) -> list[Any]:
         """Return the steps of a verification with their samples, those that come in time.
@@ -313,11 +363,7 @@ class GainsClient(LoopClient):
         return [found[key] for key in stamps if key in found]
 
     def let_settle(
-        self,
-        seconds: float,
-        tell: Callable[[str], None],
-        what: str = "the loop settles with the new gains",
-        leave: Callable[[], bool] = lambda: False,
+        self, seconds: float, tell: Callable[[str], None], what: str, leave: Callable[[], bool]
     ) -> None:
         """Let the loop run.
 
@@ -333,15 +379,14 @@ class GainsClient(LoopClient):
 
     def _verified(
         self,
-        setpoint: float,
-        load: float,
-        patience: float,
+        goal: Any,
+        new: Controller | None,
         tell: Callable[[str], None],
         leave: Callable[[], bool],
     ) -> Any:
-        """Make the steps, as soon as the loop is at rest, and return the `Verify.Result`."""
+        """Have the steps made, and return the `Verify.Result`."""
         begun = time.monotonic()
-        goal = Verify.Goal(setpoint_step=setpoint, load_step=load)
+        goal.apply = new is not None
         while not leave():
             sent = self._verify.send_goal_async(
                 goal, feedback_callback=lambda message: tell(message.feedback.status)
@@ -352,33 +397,31 @@ class GainsClient(LoopClient):
             result = answer.result
             if answer.status == GoalStatus.STATUS_SUCCEEDED:
                 return result
-            early = _is_early(result.reason) and time.monotonic() - begun < ANSWER_WITHIN
-            if not (early or result.reason.startswith(_NOT_AT_REST)):
+            if not _is_early(result.reason) or time.monotonic() - begun > ANSWER_WITHIN:
                 raise LoopError(f"{self.name} has not verified the gains: {result.reason}")
-            if time.monotonic() - begun > patience:
-                raise LoopError(
-                    f"the gains are in force, but not verified: {result.reason}; run this again "
-                    f"with --verify-only"
-                )
+            # auto_apply may be faster.
+            goal.apply = goal.apply and not (new is not None and self.has(new))
             tell(result.reason)
             self.wait(leave, TOLD_EVERY)
-        raise LoopError("the verification was ended before its step; the gains stay in force")
+        raise LoopError("the verification was ended before it began: the gains are as before")
 
     def _ended(self, goal: Any, leave: Callable[[], bool]) -> Any:
         """Return the answer to a goal once it has ended, and cancel it where that is wished."""
-        answer, cancelled = goal.get_result_async(), False
+        answer, until = goal.get_result_async(), math.inf
         while True:
             deadline = time.monotonic() + ANSWER_WITHIN
-            while time.monotonic() < deadline:
+            while time.monotonic() < min(deadline, until):
                 if self.wait(answer.done, _TURN):
                     return answer.result()
-                if leave() and not cancelled:
+                if leave() and until == math.inf:
                     goal.cancel_goal_async()
-                    cancelled = True
+                    until = time.monotonic() + ANSWER_WITHIN
             if not self._verify.server_is_ready():
-                raise LoopError(f"{self.name} has gone during the verification")
+                raise GoneError(f"{self.name} has gone during the verification")
+            if time.monotonic() >= until:
+                raise GoneError(f"{self.name} has not ended the verification")
 
 
 def _is_early(reason: str) -> bool:
     """Return whether a refusal may disappear without action."""
-    return reason == NONE_WAIT or any(part in reason for part in _NOT_YET)
+    return any(part in reason for part in _NOT_YET)

@@ -14,6 +14,7 @@ import contextlib
 import fcntl
 import json
 import os
+import stat
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import fields
@@ -22,8 +23,11 @@ from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 
+from relay_autotune.control.controller import LARGEST_GAIN
 from relay_autotune.control.gains_history import (
     AT_WORK,
+    KEPT,
+    KNOWN,
     Entry,
     GainSet,
     GainsHistory,
@@ -34,8 +38,13 @@ from relay_autotune.control.gains_history import (
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.gains_place import Place
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
+from relay_autotune.text import visible
 
 _VERSION = 1
+# A file of ours is smaller [B]: some two thousand sets, each of a few names and numbers.
+_LARGEST = 2_000_000
+# Length of a text of a file that is told.
+_TOLD = 80
 
 
 class JournalError(RelayAutotuneError):
@@ -91,22 +100,30 @@ class GainsJournal:
         :raises JournalError: if the file is not a journal of this loop.
         """
         try:
-            text = self.path.read_text(encoding="utf-8")
+            # Without waiting for the other end of a pipe.
+            descriptor = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+            with os.fdopen(descriptor, "rb") as file:
+                is_file = stat.S_ISREG(os.fstat(descriptor).st_mode)
+                text = file.read(_LARGEST + 1) if is_file else b""
         except (FileNotFoundError, NotADirectoryError):
             return None
-        except (OSError, UnicodeDecodeError) as error:
+        except OSError as error:
             raise self._unreadable(str(error)) from error
+        if len(text) > _LARGEST:
+            raise self._unreadable(f"it has more than {_LARGEST} bytes")
         try:
             found = json.loads(text)
             version, loop = found["version"], found["loop"]
             history = _history_of(found)
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise self._unreadable(f"{type(error).__name__}: {error}") from error
+        except (
+            ValueError, KeyError, TypeError, AttributeError, RecursionError,
+        ) as error:  # fmt: skip
+            raise self._unreadable(f"{type(error).__name__}: {_short(error)}") from error
         if version != _VERSION:
-            raise self._unreadable(f"it is of version {version!r}, expected {_VERSION}")
+            raise self._unreadable(f"it is of version {_short(version)}, expected {_VERSION}")
         if loop != self._loop:
             raise JournalError(
-                f"{self.path} is of the loop {loop!r}, found {self._loop!r}: give another "
+                f"{self.path} is of the loop {_short(loop)!r}, found {self._loop!r}: give another "
                 "record_directory, or remove the file"
             )
         return history
@@ -169,20 +186,38 @@ def _values_of(value: Any) -> Any:
 
 
 def _history_of(found: dict[str, Any]) -> GainsHistory:
+    def gains(value: dict[str, Any]) -> GainSet:
+        for name, number in value.items():
+            if isinstance(number, bool) or not isinstance(number, (int, float)):
+                raise ValueError(f"{name} is no number")
+            if abs(number) > LARGEST_GAIN:
+                raise ValueError(f"{name} is beyond {LARGEST_GAIN:g}")
+        return GainSet.of(value)
+
     def entry(value: dict[str, Any]) -> Entry:
-        return Entry(GainSet.of(value["gains"]), Standing(value["standing"]))
+        return Entry(gains(value["gains"]), Standing(value["standing"]))
 
     def optional(value: Any, made: Any) -> Any:
         return None if value is None else made(value)
 
+    def several(name: str, made: Any, most: int) -> Any:
+        if len(found[name]) > most:
+            raise ValueError(f"it has {len(found[name])} sets in {name}, expected at most {most}")
+        return tuple(made(each) for each in found[name])
+
     return GainsHistory(
-        given=optional(found["given"], GainSet.of),
+        given=optional(found["given"], gains),
         in_force=optional(found["in_force"], entry),
-        before=tuple(entry(each) for each in found["before"]),
-        failed=tuple(GainSet.of(each) for each in found["failed"]),
-        doubtful=tuple(GainSet.of(each) for each in found["doubtful"]),
+        before=several("before", entry, KEPT),
+        failed=several("failed", gains, KNOWN),
+        doubtful=several("doubtful", gains, KNOWN),
         work=Work(found["work"]),
     )
+
+
+def _short(text: object) -> str:
+    """Return a text of a file in one short line."""
+    return visible(str(text)[:_TOLD])
 
 
 # Time between attempts when the place of the gains does not answer [s].
@@ -192,22 +227,29 @@ _ASK_AGAIN = 1.0
 class GainsKeeper:
     """Apply gains, revert them, and mark those that are proven or failed.
 
-    The journal is written first: it names the new gains before they are sent. So if the process
-    is killed, its successor knows what to undo.
+    The journal is written first: it names the new gains before they are sent. So a change that
+    cannot be stored is refused, and if the process is killed, its successor knows what to undo.
 
     :param node: the node.
     :param place: where the gains act.
     :param journal: where their history is kept.
     :param given: gains of the node's configuration.
+    :param require: raises RelayAutotuneError for gains that may not be in force at present.
     :raises RelayAutotuneError: if the journal cannot be read.
     """
 
     def __init__(
-        self, node: ServedNode, place: Place, journal: GainsJournal, given: GainSet | None
+        self,
+        node: ServedNode,
+        place: Place,
+        journal: GainsJournal,
+        given: GainSet | None,
+        require: Callable[[GainSet], object],
     ) -> None:
         self._node = node
         self._place = place
         self._journal = journal
+        self._require = require
         self._busy = self._abandoned = False
         # The state that the place must still reach, and whether it may hold foreign gains.
         self._goal: GainsHistory | None = None
@@ -225,11 +267,12 @@ class GainsKeeper:
             self.history = GainsHistory.begun(given)
         elif place.outlives:
             self.history = found
-            if (goal := found.after_interruption()) is not found:
+            goal = found.within(self._is_allowed, present=True).cut_short()
+            if goal.work is not found.work:
                 self._goal = goal
                 self._retry.reset()
         else:
-            self.history = found.after_restart(given)
+            self.history = found.within(self._is_allowed, present=True).after_restart(given)
         if self._goal is None:
             self._write(self.history)
 
@@ -248,19 +291,9 @@ class GainsKeeper:
             soon as the place answers.
         """
         with self._alone():
-            now = self._observed(await self._place.read())
-            wanted = now.apply(gains)
-            await self._save(wanted)
-            self.history = wanted
-            try:
-                await self._place.put(gains)
-            except RelayAutotuneError as error:
-                self._goal, self._anothers = now, False
-                await self._settle()
-                raise type(error)(f"{error}{self._open()}") from error
-            if self._abandoned:
-                raise HistoryError("the node ends: the gains of before are brought back")
-            self.history = wanted.settled()
+            now = await self._seen()
+            await self._change(now, now.apply(gains))
+            self.history = self.history.settled()
             kept = await self._kept(self.history)
         return f"{self._place.said(gains)}{kept}"
 
@@ -270,62 +303,67 @@ class GainsKeeper:
         :raises RelayAutotuneError: if there is no previous set, or it is not in force.
         """
         with self._alone():
-            wanted = self.history.revert()
-            await self._place.put(wanted.gains)
-            self.history = wanted
-            kept = await self._kept(wanted)
-        return f"{self._place.said(wanted.gains)} again{kept}"
+            now = self._permitted()
+            await self._change(now, now.revert())
+        return f"{self._place.said(self.history.gains)} again"
 
-    def require_editable(self, gains: GainSet | None) -> None:
-        """Refuse a change by hand that is not allowed now.
+    def edit(self, gains: GainSet | None) -> None:
+        """Note gains that are set by hand, before they are in force.
 
-        :raises RelayAutotuneError: if the gains failed a verification, or a change is in progress.
+        :raises RelayAutotuneError: if they failed a verification, a change is in progress, or the
+            journal cannot be written.
         """
         self._require_idle()
-        self.history.edit(gains)
-
-    def edited(self, gains: GainSet | None) -> None:
-        """Note gains that were set by hand and are in force already."""
-        self.history = self.history.edit(gains)
-        self._node.compute(self._writing(self.history), self._wrote)
+        wanted = self.history.edit(gains)
+        if wanted is not self.history:
+            # In this thread, since a parameter is set as soon as this returns.
+            self._writing(wanted)()
+            self.history = wanted
 
     # Proof.
 
-    async def begin_verification(self) -> GainSet:
-        """Begin the verification of the gains in force and return them.
+    async def begin_verification(self, gains: GainSet | None) -> None:
+        """Begin the verification of gains, of which :meth:`end_verification` takes every end.
 
-        :raises RelayAutotuneError: if no gains are in force, or the journal cannot be written.
+        :param gains: a whole set that is put in force for it; None: the gains in force.
+        :raises RelayAutotuneError: as :meth:`apply`, or if no gains are in force.
         """
         with self._alone():
-            wanted = self._observed(await self._place.read()).verify()
-            await self._save(wanted)
-            self.history = wanted
-            assert wanted.gains is not None
-            return wanted.gains
+            now = await self._seen()
+            wanted = now.verify(gains)
+            if gains is None:
+                await self._save(wanted)
+                self.history = wanted
+            else:
+                await self._change(now, wanted)
 
     async def end_verification(self, passed: bool | None) -> str:
-        """Take the verdict, and restore the previous gains if these failed.
+        """Take the end of a verification: unless they passed, unproven gains are taken back.
 
-        :param passed: None: the verification ended without a verdict, and the gains stay.
+        :param passed: None: it was cut short.
         :return: a sentence for the user, or "".
         """
         if self.history.work is not Work.VERIFY:
             return ""
-        if passed is not False:
-            self.history = self.history.passed() if passed else self.history.settled()
-            return await self._kept(self.history)
+        left, now = self.history.gains, self._permitted()
+        goal = now.passed() if passed else now.cut_short() if passed is None else now.fail()
+        if goal.gains == left:
+            self.history = goal
+            return await self._kept(goal)
         # Gains before journal: the journal already marks these gains as not trusted.
-        self._goal, self._anothers = self.history.fail(), False
+        self._goal, self._anothers = goal, False
         await self._settle()
         return self._open() or f"; {self._place.said(self.history.gains)} again"
 
     async def abandon(self) -> None:
         """Undo an unfinished change, before the end of the process, if the gains outlive it."""
-        goal = self.history.after_interruption()
-        if self._place.outlives and goal is not self.history:
+        goal = self._permitted().cut_short()
+        if self._place.outlives and goal.work is not self.history.work:
             self._abandoned = True
             self._goal, self._anothers = goal, False
-            await self._settle()
+        await self._settle()
+        if left := self._open():
+            self._node.get_logger().error(f"{left.lstrip('; ')}, once this node runs again")
 
     # Helpers.
 
@@ -344,8 +382,42 @@ class GainsKeeper:
         finally:
             self._busy = False
 
-    def _observed(self, found: GainSet | None) -> GainsHistory:
+    async def _change(self, now: GainsHistory, wanted: GainsHistory) -> None:
+        """Put other gains in force.
+
+        :param now: the history before it, which comes back if they cannot be.
+        :param wanted: the history with them.
+        :raises RelayAutotuneError: if they are not in force.
+        """
+        await self._save(wanted)
+        self.history = wanted
+        try:
+            await self._place.put(wanted.gains)
+        except RelayAutotuneError as error:
+            self._goal, self._anothers = now, False
+            await self._settle()
+            raise type(error)(f"{error}{self._open()}") from error
+        if self._abandoned:
+            raise HistoryError("the node ends: the gains of before are brought back")
+
+    async def _seen(self) -> GainsHistory:
+        """Return the history with the gains that the place has, whoever set them."""
+        found = await self._place.read()
         return self.history if found is None else self.history.observe(found)
+
+    def _permitted(self) -> GainsHistory:
+        """Return the history with those earlier gains that the present limits allow."""
+        return self.history.within(self._is_allowed)
+
+    def _is_allowed(self, gains: GainSet) -> bool:
+        try:
+            self._require(gains)
+        except RelayAutotuneError as error:
+            self._node.get_logger().warning(
+                f"earlier gains are left out: {_short(gains)}: {_short(error)}"
+            )
+            return False
+        return True
 
     def _open(self) -> str:
         """Return a sentence on gains that are still to be restored, or ""."""
@@ -409,10 +481,6 @@ class GainsKeeper:
         try:
             self._writing(history)()
         except RelayAutotuneError as error:
-            self._node.get_logger().error(str(error))
-
-    def _wrote(self, error: Exception | None) -> None:
-        if error is not None:
             self._node.get_logger().error(str(error))
 
     async def _save(self, history: GainsHistory) -> None:

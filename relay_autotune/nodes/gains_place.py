@@ -111,7 +111,9 @@ class Place(ABC):
         :param gains: the parameters.
         :raises RelayAutotuneError: if they are not enough for a controller.
         """
-        values = gains.by_name()
+        values, names = gains.by_name(), set(self._mapping.values())
+        if values.keys() != names:
+            raise LoopError(f"{self.name} has the gains {', '.join(sorted(names))}")
         named = {name: values[target] for name, target in self._mapping.items()}
         return controller_of(named, self._feedforward)
 

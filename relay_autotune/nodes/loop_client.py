@@ -47,6 +47,10 @@ _OTHER_ENDS = (
 )
 
 
+class GoneError(LoopError):
+    """A node has gone, or does not answer any more."""
+
+
 class LoopClient:
     """Call the nodes of one loop.
 
@@ -175,14 +179,14 @@ class LoopClient:
 
         :param condition: what is waited for.
         :param patience: how long [s].
-        :raises LoopError: if it is no use to wait any longer.
+        :raises GoneError: if it is no use to wait any longer.
         """
 
         def is_over() -> bool:
             if condition():
                 return True
             if why := self.why_lost():
-                raise LoopError(why)
+                raise GoneError(why)
             return False
 
         return self._handle(is_over, patience)

@@ -15,7 +15,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from rclpy.task import Future
 
+from relay_autotune.control.controller import LONGEST_TIME
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import Plan, Step, compare, plan
 from relay_autotune.errors import NotReadyError, RelayAutotuneError
@@ -60,13 +62,17 @@ class Verifiable:
     """What is to be verified.
 
     :param steps: to be made.
-    :param gains: the controller in force.
+    :param new: the gains that are put in force for it; None: those in force are tried.
+    :param settles: how long the loop takes to settle with new gains [s]; NaN: not known.
+    :param gains: the controller to be tried.
     :param model: the process as identified.
     :param limits: range of the command.
     :param rate: the law that runs them; None: our own.
     """
 
     steps: Sequence[Step]
+    new: GainSet | None
+    settles: float
     gains: Controller
     model: TransferFunction
     limits: Limits
@@ -136,6 +142,7 @@ class Rest:
 class _Phase(Enum):
     IDLE = auto()
     PREPARING = auto()
+    SETTLING = auto()
     STEPPING = auto()
     RETURNING = auto()
     ENDING = auto()
@@ -149,6 +156,8 @@ class Verifier:
     :param node: the node.
     :param prepare: takes a request and returns what is to be verified; raises RelayAutotuneError
         with the reason if the loop is not ready.
+    :param begin: begins the proof of what is to be verified; raises RelayAutotuneError if it
+        cannot. Nothing has changed before, and whatever comes after, `ended` is called.
     :param move: adds a step to the set-point [y] and one to the command [u]; 0: no step.
     :param ended: called with True if all steps passed, False if one failed, None without a
         verdict, and a sentence; returns the sentence for the client.
@@ -159,14 +168,21 @@ class Verifier:
         node: ServedNode,
         *,
         prepare: Callable[[Any], Awaitable[Verifiable]],
+        begin: Callable[[Verifiable], Awaitable[None]],
         move: Callable[[float, float], None],
         ended: Callable[[bool | None, str], Awaitable[str]],
     ) -> None:
         self._node = node
         self._verifiable = prepare
+        self._on_trial = begin
         self._move = move
         self._ended = ended
         self._phase = _Phase.IDLE
+        # What ends the proof: verdict, reason, and whether the action succeeded.
+        self._outcome: Future = Future()
+        # Done at the next look.
+        self._next_look: Future = Future()
+        self._waits_for = ""
         self._recent: deque[_Sample] = deque(maxlen=_BEFORE)
         self._arrivals: deque[float] = deque(maxlen=_BEFORE)
         self._tried: Verifiable
@@ -214,45 +230,113 @@ class Verifier:
             )
 
     def _accept(self, goal: Any) -> None:
+        patience, reason = goal.request.patience, ""
         if self._action.running is not None:
             reason = "a verification is running"
+        elif not 0.0 <= patience <= LONGEST_TIME:
+            reason = f"patience is {patience:g} s, expected 0 to {LONGEST_TIME:g} s"
+        if reason:
             conclude(goal, Verify.Result(passed=False, reason=reason), succeeded=False)
             return
         self._action.running, self._phase, self._found = goal, _Phase.PREPARING, []
-        self._until = time.monotonic() + _PREPARED_WITHIN
+        self._outcome, self._waits_for = Future(), ""
+        self._until = time.monotonic() + _PREPARED_WITHIN + patience
         self._watch.reset()
         self._node.defer(self._narrator.now)
-        self._node.executor.create_task(self._prepare, goal)
+        self._node.executor.create_task(self._prove, goal)
 
-    async def _prepare(self, goal: Any) -> None:
+    async def _prove(self, goal: Any) -> None:
+        """Make a proof from its begin to its end; there is no other way out of it."""
         try:
-            tried = await self._verifiable(goal.request)
-            if not self._is_prepared(goal):
-                await self._ended(None, "the verification ended before its first step")
-                return
-            rest, period = self._at_rest(tried.steps)
-            self._tried, self._rest, self._period = tried, rest, period
-            loop = tried.gains, tried.model
-            plans = await self._node.computed(
-                lambda: [plan(*loop, s, period, rest.noise_std, tried.rate) for s in tried.steps]
-            )
+            await self._begin(goal.request)
         except Exception as error:  # noqa: BLE001  the loop goes on, and the client is told
-            if self._is_prepared(goal):
-                self._end(None, _said(error), succeeded=False)
+            self._end(None, _said(error), succeeded=False)
+        passed, reason, succeeded = await self._outcome
+        try:
+            reason = await self._ended(passed, reason)
+        except Exception as error:  # noqa: BLE001
+            reason = f"{reason}; {_said(error)}"
+        self._watch.cancel()
+        self._action.running, self._phase = None, _Phase.IDLE
+        steps = [without_arrays(message) for message in self._found]
+        result = Verify.Result(passed=passed is True, reason=reason, steps=steps)
+        self._found = []
+        conclude(goal, result, succeeded=succeeded)
+
+    async def _begin(self, request: Any) -> None:
+        """Put the gains on trial and begin the first step, unless the proof has ended before."""
+        tried = await self._verifiable(request)
+        until = time.monotonic() + request.patience
+        if tried.new is not None and self._is_preparing():
+            await self._on_trial(tried)
+            if self._is_preparing():
+                shown = self._recent[-1][0] - self._recent[0][0]
+                await self._settled(tried.settles if math.isfinite(tried.settles) else shown)
+                until = time.monotonic() + request.patience
+        rest, period = await self._rested(tried.steps, until)
+        if not self._is_preparing():
             return
-        if not self._is_prepared(goal):
+        loop = tried.gains, tried.model
+        plans = await self._node.computed(
+            lambda: [plan(*loop, s, period, rest.noise_std, tried.rate) for s in tried.steps]
+        )
+        for step, planned in zip(tried.steps, plans, strict=True):
+            planned.require_visible(step, rest.noise_std)
+        if tried.new is None and self._is_preparing():
+            await self._on_trial(tried)
+        if not self._is_preparing():
             return
+        self._tried, self._rest, self._period = tried, rest, period
         self._plans, self._number, self._beyond = plans, 0, 0
         self._begun = self._recent[-1][0]
-        planned = 2.0 * sum(p.duration for p in plans)
+        planned_time = 2.0 * sum(p.duration for p in plans)
         self._until = (
-            time.monotonic() + _TIMES_PLANNED * self._pace() * planned + _MORE_THAN_PLANNED
+            time.monotonic() + _TIMES_PLANNED * self._pace() * planned_time + _MORE_THAN_PLANNED
         )
         self._begin_step()
 
-    def _is_prepared(self, goal: Any) -> bool:
-        """Tell whether a goal has neither ended nor begun its steps."""
-        return goal is self._action.running and self._phase is _Phase.PREPARING
+    def _is_preparing(self) -> bool:
+        return self._phase is _Phase.PREPARING
+
+    async def _settled(self, seconds: float) -> None:
+        """Wait until the loop has run for a time with its new gains, or the proof has ended.
+
+        :param seconds: by the time of the samples [s].
+        """
+        self._phase = _Phase.SETTLING
+        self._until += _TIMES_PLANNED * self._pace() * seconds + _MORE_THAN_PLANNED
+        begun, self._advanced = self._recent[-1][0], time.monotonic()
+        while self._phase is _Phase.SETTLING and (done := self._recent[-1][0] - begun) < seconds:
+            self._waits_for = (
+                f"the loop settles with the new gains, {duration(done)} of {duration(seconds)}"
+            )
+            await self._look_again()
+        if self._phase is _Phase.SETTLING:
+            self._phase = _Phase.PREPARING
+
+    async def _rested(self, steps: Sequence[Step], until: float) -> tuple[Rest, float]:
+        """Return the loop's state of rest and its sample period [s], as soon as it is at rest.
+
+        :param steps: that are to be made.
+        :param until: how long to wait, on the steady clock [s].
+        :raises NotReadyError: if it does not come to rest.
+        """
+        while True:
+            try:
+                self.require_samples()
+                found = self._at_rest(steps)
+            except NotReadyError as error:
+                if self._phase is not _Phase.PREPARING or time.monotonic() >= until:
+                    raise
+                self._waits_for = str(error)
+            else:
+                self._waits_for = ""
+                return found
+            await self._look_again()
+
+    async def _look_again(self) -> None:
+        self._next_look = Future()
+        await self._next_look
 
     def _pace(self) -> float:
         """Return the steady time for one second of the samples' time."""
@@ -304,6 +388,7 @@ class Verifier:
         self._recent.append(sample)
         self._arrivals.append(now)
         if self._phase not in (_Phase.STEPPING, _Phase.RETURNING):
+            self._beyond = 0
             return
         wanted = self._plans[self._number]
         hole = max(_SILENT_INTERVALS * self._period, _LARGEST_HOLE * wanted.duration)
@@ -334,13 +419,19 @@ class Verifier:
     def out_of_range(self, measurement: float) -> None:
         """Take a measurement outside its range [y], which the controller did not answer."""
         self._beyond += 1
-        if self._phase is _Phase.STEPPING and self._beyond >= _IN_A_ROW:
+        tried = self._phase in (_Phase.SETTLING, _Phase.STEPPING)
+        if tried and self._beyond >= _IN_A_ROW:
             self._end(False, f"the measurement left its range, to {measurement:.6g}")
 
     def _return(self) -> None:
         """Remove the step, and judge it meanwhile."""
         judge = partial(
-            judged, self._tried, self._tried.steps[self._number], tuple(self._samples), self._rest
+            judged,
+            self._tried,
+            self._tried.steps[self._number],
+            self._plans[self._number],
+            tuple(self._samples),
+            self._rest,
         )
         self._node.compute(judge, partial(self._judged, self._action.running))
         self._phase, self._samples = _Phase.RETURNING, []
@@ -371,8 +462,8 @@ class Verifier:
 
     def _words(self) -> str:
         """Say what the verification waits for and sees; empty where none runs."""
-        if self._phase is _Phase.PREPARING:
-            return "computing what the step will do"
+        if self._phase in (_Phase.PREPARING, _Phase.SETTLING):
+            return self._waits_for or "computing what the step will do"
         if self._phase not in (_Phase.STEPPING, _Phase.RETURNING):
             return ""
         samples, wanted = self._samples, self._plans[self._number]
@@ -389,7 +480,7 @@ class Verifier:
     def _tell(self, status: str) -> None:
         if self._action.running is None:
             return
-        planned = self._phase is not _Phase.PREPARING
+        planned = self._phase in (_Phase.STEPPING, _Phase.RETURNING)
         elapsed = self._recent[-1][0] - self._begun if planned else 0.0
         whole = 2.0 * sum(p.duration for p in self._plans) if planned else 0.0
         self._action.running.publish_feedback(
@@ -405,10 +496,11 @@ class Verifier:
 
     def interrupt(self, reason: str) -> None:
         """End the verification without a verdict."""
-        if self._phase not in (_Phase.IDLE, _Phase.ENDING):
-            self._end(None, reason)
+        self._end(None, reason)
 
     def _look(self) -> None:
+        if not self._next_look.done():
+            self._next_look.set_result(None)
         now = time.monotonic()
         if now > self._until:
             self.interrupt("the verification took far longer than planned on the steady clock")
@@ -424,30 +516,33 @@ class Verifier:
             self.interrupt("the time of the samples stands still: is /clock published?")
 
     def _end(self, passed: bool | None, reason: str, *, succeeded: bool = True) -> None:
-        if self._phase is not _Phase.PREPARING:
+        if self._phase in (_Phase.IDLE, _Phase.ENDING):
+            return
+        if self._phase in (_Phase.STEPPING, _Phase.RETURNING):
             self._move(0.0, 0.0)
         self._phase = _Phase.ENDING
-        self._watch.cancel()
-        self._node.executor.create_task(self._conclude, passed, reason, succeeded)
-
-    async def _conclude(self, passed: bool | None, reason: str, succeeded: bool) -> None:
-        reason = await self._ended(passed, reason)
-        goal, self._action.running, self._phase = self._action.running, None, _Phase.IDLE
-        steps = [without_arrays(message) for message in self._found]
-        result = Verify.Result(passed=passed is True, reason=reason, steps=steps)
-        self._found = []
-        conclude(goal, result, succeeded=succeeded)
+        # As a task, so that the executor wakes.
+        self._node.executor.create_task(self._outcome.set_result, (passed, reason, succeeded))
 
 
-def judged(tried: Verifiable, step: Step, samples: tuple[_Sample, ...], rest: Rest) -> Any:
+def judged(
+    tried: Verifiable, step: Step, planned: Plan, samples: tuple[_Sample, ...], rest: Rest
+) -> Any:
     """Compare a step with its prediction and return the `Verification` message.
 
     :param tried: gains, model and limits.
     :param step: the step.
+    :param planned: for it.
     :param samples: time [s], measurement [y] and command [u] of each, the first at the step.
     :param rest: where the loop was before it.
+    :raises RelayAutotuneError: if the measurement is too coarse to judge it.
     """
     t, y, u = (np.array(column) for column in zip(*samples, strict=True))
+    levels = np.unique(y)
+    if levels.size < 2:
+        raise NotReadyError("the measurement did not change at all")
+    # A loop at rest does not show how coarse its sensor is; rounding is noise, too.
+    planned.require_visible(step, float(np.diff(levels).min()) / math.sqrt(12.0))
     limits = tried.limits
     found = compare(
         tried.gains,

@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
 import sys
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +18,7 @@ from relay_autotune.cli import apply_gains
 from relay_autotune.cli.apply_gains import beside, found_lines, verdict_lines
 from relay_autotune.cli.tune_page import GainsPage
 from relay_autotune.control.verification import StepRange
-from relay_autotune.errors import TuningError
+from relay_autotune.errors import LoopError, TuningError
 from relay_autotune.exchange.messages import fill_gains
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.verifier import without_arrays
@@ -129,15 +131,63 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     assert not asked and not answers
 
 
+def client_of(prove: Any, in_force: Any) -> Any:
+    return SimpleNamespace(
+        in_force=in_force, model=lambda: MODEL, noise=lambda: 0.01,
+        waiting=lambda: (GAINS, ""), has=lambda gains: in_force() is gains,
+        allowed_steps=lambda gains: StepRange(), name="controller_node", prove=prove,
+        values=lambda node, names: {"verify_step": 0.0},
+    )  # fmt: skip
+
+
+def test_ctrl_c_in_a_proof_ends_it_and_the_last_line_says_what_is_in_force(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The signal is noted, and obeyed when the node has taken the gains back."""
+
+    def prove(step: float, load: float, wait: float, tell: Any, leave: Any, new: Any) -> None:
+        assert new is GAINS and not leave()
+        os.kill(os.getpid(), signal.SIGINT)
+        assert leave()
+        raise LoopError("cancelled; kc 0.1 in force again")
+
+    given = apply_gains._parser().parse_args(["--yes", "--step", "0.5"])
+    with pytest.raises(KeyboardInterrupt):
+        apply_gains.apply_and_verify(client_of(prove, lambda: None), given)
+    assert capsys.readouterr().err.endswith("cancelled; kc 0.1 in force again\n")
+
+
+def test_new_gains_that_could_not_be_taken_back_are_told_as_such(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    failed = Verify.Result(passed=False, reason="no measurement for 2 s")
+    given = apply_gains._parser().parse_args(["--yes", "--step", "0.5"])
+    present: list[Any] = [Controller(0.1, 3.0)]
+    client = client_of(lambda *words: present.append(GAINS) or failed, lambda: present[-1])
+    assert apply_gains.apply_and_verify(client, given) == 1
+    told = " ".join(capsys.readouterr().out.split("gains in force")[-1].split())
+    assert "these are the new ones, which are not proven" in told
+    present[:] = [Controller(0.1, 3.0)]
+    client = client_of(lambda *words: present.append(None) or failed, lambda: gone(present))
+    assert apply_gains.apply_and_verify(client, given) == 1
+    assert "gains in force not known: it is gone" in " ".join(capsys.readouterr().out.split())
+
+
+def gone(present: list[Any]) -> Any:
+    if present[-1] is None:
+        raise LoopError("it is gone")
+    return present[-1]
+
+
 def test_the_page_refuses_a_step_beyond_the_limits_before_anything_changes() -> None:
     changed: list[Any] = []
     controller: Any = SimpleNamespace(
         in_force=lambda: Controller(0.1, 3.0), allowed_steps=lambda gains: StepRange(-1.5, 2.0),
-        put_in_force=changed.append, prove=lambda *words: changed.append(words),
+        offered=changed.append, prove=lambda *words: changed.append(words),
     )  # fmt: skip
     live: Any = SimpleNamespace(tell=lambda **told: None, show=lambda *shown: None)
     page = GainsPage(Any, live, Any, 0, lambda: False)  # type: ignore[arg-type]
-    page._message = lambda wish: (MESSAGE, 1.0)  # type: ignore[method-assign]
+    page._message = lambda wish: MESSAGE  # type: ignore[method-assign]
     for what in (VERIFY, APPLY):
         with pytest.raises(TuningError, match=r"is -1.6 y, expected from -1.5 to 2 y"):
             page._do(Wish(what, step=-1.6), controller)

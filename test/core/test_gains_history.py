@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import settings
@@ -97,9 +98,31 @@ def test_gains_whose_verification_was_cut_short_come_by_hand_alone():
 
 def test_where_the_gains_outlive_the_process_an_apply_that_was_finished_stays():
     begun = GainsHistory().observe(G)
-    assert applied(begun, A).after_interruption().gains == A
-    assert begun.apply(A).after_interruption().gains == G
-    assert applied(begun, A).verify().after_interruption().gains == G
+    assert applied(begun, A).cut_short().gains == A
+    assert begun.apply(A).cut_short().gains == G
+    assert applied(begun, A).verify().cut_short().gains == G
+
+
+def test_a_proof_that_is_cut_short_leaves_what_was_in_force_before_it():
+    begun = GainsHistory.begun(G)
+    for on_trial in (begun.verify(A), applied(begun, A).verify(), begun.edit(A).verify()):
+        history = on_trial.cut_short()
+        assert (history.gains, history.work) == (G, Work.NOTHING)
+        assert not history.is_open_to(A)
+    assert begun.verify(A).passed().verify().cut_short().gains == A
+    assert GainsHistory.begun(None).verify(A).cut_short().gains is None
+    # Found in another node later, they are not trusted either.
+    found = begun.verify(A).cut_short().observe(A)
+    assert not found.in_force.is_trusted
+
+
+def test_gains_beyond_the_present_limits_do_not_come_back():
+    history = applied(applied(GainsHistory.begun(G), B), A).verify().passed()
+    within = history.within(lambda gains: gains.by_name()["kc"] < 0.4, present=True)
+    assert within.after_restart(G).gains == G
+    assert history.within(lambda gains: gains != B).revert().gains == G
+    # Where none is left, those of the configuration are.
+    assert replace(within, before=()).after_restart(G).gains == G
 
 
 def test_many_sets_do_not_push_out_the_last_that_can_be_trusted():
@@ -153,7 +176,7 @@ class Controllers(RuleBasedStateMachine):
         except HistoryError:
             assert self.history.work is not Work.NOTHING or wanted in self.failed
             return False
-        if event == "apply":
+        if event in ("apply", "verify"):
             self.leave()
         self.history = state
         assert self.history.gains == wanted
@@ -168,6 +191,11 @@ class Controllers(RuleBasedStateMachine):
     @rule()
     def applied(self) -> None:
         self.history = self.history.settled()
+
+    @rule(wanted=SETS)
+    def put_on_trial(self, wanted: GainSet) -> None:
+        if self.attempt("verify", wanted):
+            self.whole.add(wanted)
 
     @rule(wanted=st.none() | SETS)
     def edit(self, wanted: GainSet | None) -> None:
@@ -195,7 +223,11 @@ class Controllers(RuleBasedStateMachine):
         tried = self.history.gains
         assert tried is not None
         if passed is None:
-            self.history = self.history.settled()
+            before = self.history
+            self.history = self.history.cut_short()
+            assert self.history.gains == tried or not before.in_force.is_trusted
+            assert self.history.gains in {None, *self.whole} - self.failed
+            assert self.history.gains != tried or tried in self.trusted
         elif passed:
             self.history = self.history.passed()
             self.trusted.add(tried)

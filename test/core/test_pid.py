@@ -24,6 +24,7 @@ from relay_autotune.control.verification import (
     noise_of,
     plan,
     proving_step,
+    rounded_up,
 )
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
@@ -228,13 +229,15 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
     wanted = plan(gains, model, Step(setpoint=1.0), 0.01)
     assert 1.1 < wanted.peak < 2.0
     limits = Limits(30.0, 42.0)
-    allowed = allowed_steps(record, model, limits, Limits(0.0, 5.0), wanted.peak, 0.02)
+    allowed = allowed_steps(record, model, limits, Limits(0.0, 5.0), wanted, 0.02)
     low, high = allowed.low, allowed.high
+    assert allowed.least == rounded_up(0.02 * wanted.visible) == pytest.approx(0.15, abs=0.04)
     # The command holds down to 3.3 below; the peak of the next step of two digits is too high.
     assert low == -3.3
     at_peak = [plan(gains, model, Step(setpoint=h), 0.01).peak for h in (high, high + 0.1)]
     assert at_peak[0] < 2.0 - 3.0 * 0.02 < at_peak[1]
-    narrow = allowed_steps(record, model, Limits(39.9, 40.05), Limits(0.0, 5.0), 1.2, 0.02)
+    peak = replace(wanted, peak=1.2, visible=0.0)
+    narrow = allowed_steps(record, model, Limits(39.9, 40.05), Limits(0.0, 5.0), peak, 0.02)
     assert narrow == StepRange(-0.033, 0.0)
     narrow.require(-0.03)
     for wrong in (0.01, 0.0, -0.04, math.nan):
@@ -242,6 +245,33 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
             narrow.require(wrong)
     StepRange().require(-1e9)
     assert (narrow.nearest(-0.04), narrow.nearest(-0.02)) == (-0.033, -0.02)
+    noisy = replace(narrow, least=0.03)
+    assert noisy.nearest(-0.02) == -0.03
+    with pytest.raises(TuningError, match=r"less than 0\.03 y cannot be judged"):
+        noisy.require(-0.02)
+
+
+# The largest deviation by a load takes up noise, which makes its comparison looser.
+@pytest.mark.parametrize(("step", "less"), [(Step(setpoint=1.0), 0.2), (Step(load=1.0), 0.06)])
+def test_the_least_step_is_where_the_noise_begins_to_decide(step, less):
+    """The chance of a wrong verdict by its definition: many steps, judged."""
+    period, rng = 0.1, np.random.default_rng(7)
+    wanted = plan(GAINS, PROCESS, step, period)
+    time = np.arange(int(wanted.duration / period) + 1) * period
+
+    def failed(height: float, count: int) -> int:
+        made = replace(step, setpoint=height * step.setpoint, load=height * step.load)
+        response = run_loop(
+            GAINS, PROCESS, time, setpoint=made.setpoint, load=made.load
+        ).measurement
+        noisy = (response + rng.normal(size=time.size) for _ in range(count))
+        found = (compare(GAINS, PROCESS, made, time, y, noise_std=1.0).passed for y in noisy)
+        return count - sum(found)
+
+    assert failed(wanted.visible, 20) == 0
+    assert failed(less * wanted.visible, 20) >= 2
+    with pytest.raises(TuningError, match=r"cannot be judged"):
+        wanted.require_visible(replace(step, setpoint=1e-9 * step.setpoint, load=1e-9), 0.01)
 
 
 def test_a_longer_dead_time_fails():

@@ -5,17 +5,25 @@
 
 from __future__ import annotations
 
+import json
+import math
+import os
 import subprocess
 import sys
 import time
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from random import Random
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from relay_autotune.control.controller import GainBounds
 from relay_autotune.control.gains_history import GainSet, GainsHistory, Work
-from relay_autotune.nodes.gains_keeper import GainsJournal, JournalError
+from relay_autotune.nodes.gains_keeper import GainsJournal, GainsKeeper, JournalError
+from relay_autotune.nodes.gains_place import OwnGains
 
 GIVEN = GainSet.of({"kc": 0.1 + 0.2, "ti": 1e-9, "b": 1.0})
 OTHER = GainSet.of({"kc": -1e12, "ti": 2.0, "b": 0.0})
@@ -33,6 +41,37 @@ print("ready", flush=True)
 for k in range(10**9):
     journal.save(GainsHistory.begun(GainSet.of({"kc": k + 1.0, "ti": k + 1.0})), journal.ticket())
 """
+
+
+def written(**others: Any) -> dict[str, Any]:
+    """Return an empty journal as the file has it."""
+    lists: dict[str, Any] = {"before": [], "failed": [], "doubtful": []}
+    whole = {"version": 1, "loop": "y", "given": None, "in_force": None, "work": "nothing"}
+    return whole | lists | others
+
+
+def own(kc: float, ti: float = 1.0, **others: float) -> dict[str, float]:
+    return {"kc": kc, "ti": ti, "td": 0.0, "tf": 0.0, "b": 1.0} | others
+
+
+class Elsewhere(OwnGains):
+    """A place whose gains outlive this process, and which is never asked here."""
+
+    outlives = True
+
+
+def keeper_of(
+    journal: GainsJournal, given: GainSet | None, bounds: GainBounds, kind: type[OwnGains]
+) -> GainsKeeper:
+    """Return a keeper as controller_node makes it, beside a node that does nothing."""
+    place = kind(lambda gains: None, None)
+    nothing = lambda *words, **named: None  # noqa: E731
+    log = SimpleNamespace(warning=nothing, error=nothing, info=nothing)
+    timer = SimpleNamespace(reset=nothing, cancel=nothing)
+    node: Any = SimpleNamespace(create_timer=lambda *w, **n: timer, get_logger=lambda: log)
+    return GainsKeeper(
+        node, place, journal, given, lambda gains: bounds.require(place.controller_of(gains))
+    )
 
 
 def journal_in(
@@ -107,6 +146,14 @@ def test_a_state_that_was_overtaken_is_left_out(tmp_path):
         '{"version": 1, "loop": "y", "given": {"kc": NaN}, "in_force": null, "before": [],'
         ' "failed": [], "doubtful": [], "work": "nothing"}',
         "[" * 100_000,
+        json.dumps(written() | {"given": {"ti": 1.0, "kc": 10**400}}),
+        json.dumps(written() | {"given": {"ti": 1.0, "kc": 1e300}}),
+        json.dumps(written() | {"given": {"ti": 1.0, "kc": True}}),
+        json.dumps(written() | {"in_force": {"gains": {"kc": "5"}, "standing": "proven"}}),
+        json.dumps(
+            written() | {"before": [{"gains": {"kc": 1.0}, "standing": "given"}] * 200_000}
+        ),
+        json.dumps(written() | {"loop": "y" * 3_000_000}),
     ],
 )
 def test_a_file_that_is_no_journal_is_refused(tmp_path, text):
@@ -130,3 +177,101 @@ def test_a_folder_that_cannot_be_written_is_said(tmp_path):
     journal = journal_in(tmp_path / "file")
     with pytest.raises(JournalError, match="cannot be kept in"):
         journal.save(HISTORY, journal.ticket())
+
+
+def test_the_present_limits_hold_for_gains_that_were_proven_before(tmp_path):
+    journal, given = journal_in(tmp_path), GainSet.of(own(0.3))
+    proven = GainsHistory.begun(given).verify(GainSet.of(own(5.0, 0.5))).passed()
+    for bounds, kept in (
+        (GainBounds(), own(5.0, 0.5)),
+        (GainBounds(kc_max=2.0), own(0.3)),
+        (GainBounds(ti_min=0.6), own(0.3)),
+    ):
+        journal.save(proven, journal.ticket())
+        history = keeper_of(journal, given, bounds, OwnGains).history
+        assert history.gains == GainSet.of(kept)
+
+
+HOSTILE = [
+    None, True, "5", "proven", "given", "verify", [], {}, 0, -1, 1e300, -1e12, 10**400, math.nan,
+    math.inf, [[]], {"kc": 1.0}, own(1.0, b=1e300), own(1.5, ti=-1.0), own(0.0), "\x1b[2K",
+]  # fmt: skip
+
+
+def damaged(value: Any, rng: Random) -> Any:
+    """Return a document with something else at some place in it."""
+    if not isinstance(value, (dict, list)) or not value or rng.random() < 0.15:
+        return rng.choice(HOSTILE)
+    value = copy(value)
+    key = rng.choice(list(value) if isinstance(value, dict) else range(len(value)))
+    if rng.random() < 0.15:
+        del value[key]
+    else:
+        value[key] = damaged(value[key], rng)
+    return value
+
+
+def random_document(rng: Random) -> dict[str, Any]:
+    def gains() -> dict[str, float]:
+        return own(rng.choice([0.3, 0.5, 1.5, 1.9, 5.0, 1e9]), rng.choice([0.0, 0.01, 0.5, 2.0]))
+
+    def entries(most: int) -> list[Any]:
+        standing = ["given", "edited", "applied", "proven"]
+        return [
+            {"gains": gains(), "standing": rng.choice(standing)}
+            for _ in range(rng.randint(0, most))
+        ]
+
+    return written(
+        given=rng.choice([None, own(0.3)]),
+        in_force=(entries(1) or [None])[0],
+        before=entries(rng.choice([3, 20, 25])),
+        failed=[gains() for _ in range(rng.randint(0, 3))],
+        doubtful=[gains() for _ in range(rng.randint(0, 2))],
+        work=rng.choice(["nothing", "apply", "verify"]),
+    )
+
+
+@pytest.mark.parametrize("kind", [OwnGains, Elsewhere])
+def test_no_journal_puts_gains_in_force_that_are_neither_proven_nor_asked_for(
+    tmp_path, monkeypatch, kind
+):
+    """1,000 journals of each kind, of which most are damaged."""
+    monkeypatch.setattr(os, "fsync", lambda descriptor: None)
+    rng, bounds, given = Random(26), GainBounds(kc_max=2.0, ti_min=0.1), GainSet.of(own(0.3))
+    read = 0
+    for number in range(1000):
+        journal = journal_in(tmp_path, f"/{number}")
+        document = random_document(rng)
+        for _ in range(rng.choice([0, 0, 1, 1, 2, 3])):
+            document = damaged(document, rng)
+        text = json.dumps(document).encode()
+        if rng.random() < 0.15:
+            at = rng.randrange(len(text))
+            text = text[:at] + rng.randbytes(rng.randint(0, 4)) + text[at + rng.randint(1, 9) :]
+        journal.path.write_bytes(text)
+        try:
+            keeper = keeper_of(journal, given, bounds, kind)
+        except JournalError as error:
+            assert str(error).isprintable() and len(str(error)) < 400
+            continue
+        finally:
+            journal.close()
+        read += 1
+        history = keeper._goal or keeper.history
+        if kind is Elsewhere and keeper._goal is None:
+            # Nothing is sent to the other node.
+            continue
+        if history.gains in (None, given):
+            continue
+        document = json.loads(text)
+        values, trusted = history.gains.by_name(), ("given", "proven")
+        # Another node may go back to what was only applied.
+        others = () if kind is OwnGains else ("applied", "edited")
+        known = [e["gains"] for e in document["before"] if e["standing"] in (*trusted, *others)]
+        if (last := document["in_force"]) is not None and last["standing"] in trusted:
+            known.append(last["gains"])
+        assert values in known
+        assert values not in list(document["failed"])
+        assert abs(values["kc"]) <= 2.0 and (values["ti"] == 0.0 or values["ti"] >= 0.1)
+    assert read > 200

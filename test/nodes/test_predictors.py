@@ -1,16 +1,24 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which model predicts the step that proves gains."""
+"""Which model predicts the step that proves gains, and what a sensor lets one judge."""
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
+import numpy as np
 import pytest
 
+from relay_autotune.control.controller import run_loop
 from relay_autotune.control.gains_history import GainSet
-from relay_autotune.errors import NotReadyError
+from relay_autotune.control.verification import Step, plan
+from relay_autotune.errors import NotReadyError, TuningError
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.sampled import UNLIMITED
 from relay_autotune.nodes.results import keep
-from relay_autotune.nodes.verifier import Predictors
+from relay_autotune.nodes.verifier import Predictors, Rest, Verifiable, judged
 from relay_autotune.process.transfer_function import TransferFunction
 
 GOOD, WILD, BY_HAND = (GainSet.of({"kc": kc, "ti": 0.3}) for kc in (0.5, 0.9, 0.7))
@@ -44,3 +52,24 @@ def test_gains_without_an_experiment_take_the_newest_model() -> None:
     keep(known, "", (TRUE, ""))
     models.applied(GOOD, "third")
     assert models.of(GOOD) == (TRUE, "")
+
+
+def test_a_sensor_that_is_too_coarse_for_a_step_gives_no_verdict() -> None:
+    """The loop stands on one of its values, so that its rest shows no noise."""
+    gains, step = Controller(0.5, 0.6), Step(setpoint=0.01)
+    model = TransferFunction.fopdt(2.0, 0.5, 0.2)
+    tried = Verifiable([step], None, math.nan, gains, model, UNLIMITED, None)
+    planned, rest = plan(gains, model, step, 0.05), Rest(5.0, 1.0, 0.0)
+    time = np.arange(0.0, planned.duration, 0.05)
+    exact = 5.0 + run_loop(gains, model, time, setpoint=0.01).measurement
+
+    def seen(resolution: float) -> Any:
+        y = np.round(exact / resolution) * resolution
+        samples = tuple(zip(time, y, np.ones(time.size), strict=True))
+        return judged(tried, step, planned, samples, rest)
+
+    assert seen(1e-4).passed
+    with pytest.raises(TuningError, match="cannot be judged"):
+        seen(0.01)
+    with pytest.raises(NotReadyError, match="did not change at all"):
+        seen(0.5)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from random import Random
 from typing import Any
 
 from fopdt_plant import FopdtPlant
@@ -17,7 +18,7 @@ from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import Float64
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 from relay_autotune.process.transfer_function import TransferFunction as Process
 from relay_autotune_msgs.action import Verify
@@ -33,11 +34,15 @@ class HandLoop:
 
     :param rig: the rig.
     :param gain: static gain of the process [y/u].
+    :param noise_std: standard deviation of the measurement's noise [y].
     :param parameters: further parameters of controller_node.
     """
 
-    def __init__(self, rig: Rig, gain: float = 2.0, **parameters: Any) -> None:
+    def __init__(
+        self, rig: Rig, gain: float = 2.0, noise_std: float = 0.0, **parameters: Any
+    ) -> None:
         self.rig = rig
+        self.noise, self.random = noise_std, Random(1)
         self.time = 1e8
         self.parameters = {
             "measurement_type": "sensor_msgs/msg/Temperature",
@@ -95,7 +100,8 @@ class HandLoop:
         for _ in range(count):
             self.elapsed += PERIOD
             away = self.process.advance(self.elapsed, self.command - COMMAND)
-            self.command = self.answer_to(SETPOINT + away, later)
+            seen = SETPOINT + away + self.random.gauss(0.0, self.noise)
+            self.command = self.answer_to(seen, later)
 
     def publish(self, kc: float, ti: float, name: str, gain: float = 2.0) -> None:
         """Publish a record, a model and gains of an experiment."""
@@ -123,6 +129,10 @@ class HandLoop:
     def trigger(self, name: str) -> Any:
         return self.rig.call(Trigger, f"controller_node/{name}", Trigger.Request())
 
+    def set_automatic(self, automatic: bool) -> None:
+        request = SetBool.Request(data=automatic)
+        self.rig.call(SetBool, "controller_node/automatic", request)
+
     def set(self, **values: float) -> Any:
         parameters = [Parameter(k, value=v).to_parameter_msg() for k, v in values.items()]
         request = SetParametersAtomically.Request(parameters=parameters)
@@ -134,7 +144,7 @@ class HandLoop:
         return kc, ti
 
     def verify(
-        self, during: Callable[[], None] | None = None, after: int = 3, **request: float
+        self, during: Callable[[], None] | None = None, after: int = 3, **request: Any
     ) -> Any:
         """Verify a loop at rest and return the result; do something once the step has begun."""
         self.step(160)

@@ -179,8 +179,10 @@ def test_verify_is_bounded_and_ends_without_a_verdict_where_time_is_wrong(rig: R
         result = loop.verify(lambda later=later: loop.step(later=later), setpoint_step=0.3)
         assert not result.passed
         assert reason in result.reason
-        # The verification had no verdict.
-        assert loop.gains_shown() == GOOD
+        # Unproven gains go back, and wait to be tried again.
+        assert "kc 0.3, ti 1 s, td 0 s in force again" in result.reason
+        assert loop.gains_shown() == (0.3, 1.0)
+        assert loop.trigger("apply").success
     # Before the step as well.
     result = loop.verify(setpoint_step=0.3)
     assert result.passed, result.reason
@@ -206,7 +208,63 @@ def test_a_set_point_of_the_operator_is_no_failure_of_the_gains(rig: Rig) -> Non
     result = loop.verify(other, setpoint_step=0.3)
     assert not result.passed
     assert "the set-point was changed to 5.6" in result.reason
+    # They were proven before.
     assert loop.gains_shown() == GOOD
     loop.step(120)
     # It stays in force: a deviation of 0.6 needs 0.3 of command.
     assert loop.command == pytest.approx(1.3, abs=0.02)
+
+
+def test_a_step_that_the_noise_hides_changes_nothing(rig: Rig) -> None:
+    loop = HandLoop(rig, kc=0.3, ti=1.0, noise_std=0.01)
+    loop.apply(*GOOD, "good")
+    for step in (1e-9, 0.001):
+        result = loop.verify(setpoint_step=step)
+        assert not result.passed
+        assert "y cannot be judged" in result.reason
+        assert loop.gains_shown() == GOOD
+    # It was not on trial, so that it did not fail.
+    assert loop.verify(setpoint_step=0.3).passed
+
+
+def test_gains_are_put_in_force_and_proven_in_one_go_or_not_at_all(rig: Rig) -> None:
+    loop = HandLoop(rig, kc=0.3, ti=1.0, noise_std=0.002)
+    loop.offer(*GOOD, "good")
+    # The loop settles with them before the step.
+    result = loop.verify(lambda: loop.set_automatic(False), setpoint_step=0.3, apply=True)
+    assert "switched to manual; kc 0.3, ti 1 s, td 0 s in force again" in result.reason
+    assert loop.gains_shown() == (0.3, 1.0)
+    loop.set_automatic(True)
+    result = loop.verify(setpoint_step=1e-9, apply=True, patience=60.0)
+    assert "y cannot be judged; kc 0.3" in result.reason
+    assert loop.gains_shown() == (0.3, 1.0)
+    result = loop.verify(setpoint_step=0.3, apply=True, patience=60.0)
+    assert result.passed, result.reason
+    assert loop.gains_shown() == GOOD
+    assert "no gains wait" in loop.verify(setpoint_step=0.3, apply=True).reason
+
+
+def test_a_change_that_cannot_be_stored_is_refused(rig: Rig) -> None:
+    loop = HandLoop(rig, kc=0.3, ti=1.0)
+    loop.apply(*GOOD, "good")
+    (journal,) = rig.records.glob("gains.controller_node*.json")
+    # As good as a full disk: nothing can be written there.
+    journal.with_suffix(".tmp").mkdir()
+    by_hand, reverted = loop.set(kc=0.7), loop.trigger("revert")
+    assert not by_hand.successful and "cannot be kept in" in by_hand.reason
+    assert not reverted.success and "cannot be kept in" in reverted.message
+    assert loop.gains_shown() == GOOD
+    assert "cannot be kept in" in loop.verify(setpoint_step=0.3).reason
+    journal.with_suffix(".tmp").rmdir()
+    assert loop.trigger("revert").success
+
+
+def test_gains_beyond_new_limits_do_not_come_back_after_a_restart(rig: Rig) -> None:
+    loop = HandLoop(rig, kc=0.3, ti=1.0)
+    loop.apply(*GOOD, "good")
+    assert loop.verify(setpoint_step=0.3).passed
+    loop.node.signal(signal.SIGTERM)
+    loop.node.wait()
+    loop.start(kc_max=0.4)
+    assert loop.gains_shown() == (0.3, 1.0)
+    assert "expected at most 0.4" in loop.node.log

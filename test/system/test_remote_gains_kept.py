@@ -16,6 +16,9 @@ from rclpy.action import ActionClient
 from remote_loop import VERDICT, Loop
 from std_msgs.msg import Float64
 
+from relay_autotune.exchange.messages import fill_gains
+from relay_autotune.process.transfer_function import TransferFunction as Process
+from relay_autotune.tuning import DesignOptions, DesignTask, design
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, TransferFunction
 
@@ -121,3 +124,35 @@ def test_the_end_of_the_process_in_a_verification_brings_the_gains_back(
         rig.until(lambda: loop.values() == BEFORE, "the gains of before")
         rig.until(lambda: "gains of tried wait" in loop.controller.log, "the latched gains")
     assert loop.values() == BEFORE
+
+
+@pytest.mark.parametrize("ended", ["apply_gains", "controller_node"])
+def test_a_proof_by_command_that_is_cut_short_leaves_the_gains_of_before(
+    rig: Rig, ended: str
+) -> None:
+    loop = Loop(rig)
+    setpoint = rig.node.create_publisher(Float64, "setpoint", 10)
+    rig.until(lambda: setpoint.get_subscription_count() == 3, "both controllers")
+    setpoint.publish(Float64(data=5.0))
+    process = Process.fopdt(2.0, 0.3, 0.1)
+    model = TransferFunction(final=True, verdict=VERDICT, dead_time=0.1)
+    model.numerator, model.denominator = [2.0], [0.3, 1.0]
+    loop.models.publish(model)
+    message = PidGains()
+    fill_gains(message, design(DesignTask(model=process, options=DesignOptions()), "imc"))
+    message.final, message.verdict = True, VERDICT
+    loop.gains.publish(message)
+    rig.until(lambda: "wait: kc" in loop.controller.log, "the gains")
+    command = rig.start_command("apply_gains", "--yes", "--step", "0.5")
+    rig.until(lambda: any(m.data == 5.5 for m in loop.setpoints), "the step")
+    assert loop.values()[0] == pytest.approx(message.kc)
+    if ended == "apply_gains":
+        command.signal(signal.SIGINT)
+        assert command.wait() == 130
+        rig.until(lambda: loop.setpoints[-1].data == 5.0, "the set-point")
+    else:
+        loop.controller.signal(signal.SIGKILL)
+        assert command.wait() == 1
+    assert loop.values() == BEFORE
+    last = command.log.strip().splitlines()[-1]
+    assert "/pid_controller has gains.heater" in last, command.log
