@@ -419,7 +419,13 @@ class JointTune:
                 stack.close()
                 return ""
 
-            yield why_over
+            try:
+                yield why_over
+            except LoopError:
+                # A node that is lost leaves the reference where the relay had it.
+                if forward is None:
+                    self._put_back()
+                raise
 
     def _first_command(self) -> tuple[Any, str]:
         """Return the message of the first command, and its topic."""
@@ -427,6 +433,18 @@ class JointTune:
         beside = json.loads(values["command_message"])
         message = CommandMessage(values["command_type"], values["command_field"], beside)
         return message.written(self._baseline), topics["command"]
+
+    @property
+    def left_behind(self) -> str:
+        """What follows where relay_node is lost during a tune."""
+        what = "the controllers" if self._forward else "the reference"
+        return f"{self._loop.joint} gets back {what} of before"
+
+    def _put_back(self) -> None:
+        """Give the references back, if the controller that takes them is active."""
+        with suppress(LoopError):
+            if not self.activation():
+                self._give_references_back()
 
     def _give_references_back(self) -> None:
         """Publish the references of before, which the controller forgets when it is switched."""
@@ -530,9 +548,7 @@ class JointTune:
         except GoneError:
             # It would have taken its step back.
             nodes.end("controller_node")
-            with suppress(LoopError):
-                if not self.activation():
-                    self._give_references_back()
+            self._put_back()
             raise
 
     def _set(self, tuned: TuneClient) -> int:

@@ -192,6 +192,8 @@ def _tune(options: argparse.Namespace, ros: list[str]) -> int:
         if new:
             nodes = stack.enter_context(joint.nodes() if joint else nodes_for(client, options))
             client.why_lost = nodes.why_lost
+            if joint:
+                client.left_behind = joint.left_behind
             patience = max(patience, START_WITHIN)
         deadline = time.monotonic() + patience
 

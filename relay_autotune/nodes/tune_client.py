@@ -68,6 +68,10 @@ class TuneClient(LoopClient):
         self._goal: Any = None
         self._answer: Any = None
         self._seen = time.monotonic()
+        self.left_behind = (
+            "nobody publishes the command, and the last one stays in force; see to the plant"
+        )
+        """What follows where relay_node is lost during a tune."""
         self.refused: set[str] = set()
         """Sentences on results that were received and refused."""
 
@@ -153,10 +157,7 @@ class TuneClient(LoopClient):
             )
         else:
             why = self.why_lost() or f"{self.name} has gone, or cannot be heard any more"
-            raise LoopError(
-                f"during the tune {why}: nobody publishes the command, and the last one stays in "
-                f"force; see to the plant"
-            )
+            raise LoopError(f"during the tune {why}: {self.left_behind}")
 
     def _on_liveliness(self, info: Any) -> None:
         self._alive = info.alive_count > 0

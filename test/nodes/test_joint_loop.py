@@ -252,6 +252,7 @@ def test_controllers_are_off_until_the_relay_ends_and_no_longer(is_open: bool) -
         _first_command=lambda: ("rest", "/one/commands"),
         _client=SimpleNamespace(publishing=lambda *_: publishing),
         _give_references_back=lambda: given.append("references"),
+        _put_back=lambda: given.append("references"),
     )  # fmt: skip
     with JointTune.opened(tune) as why_over:
         assert why_over(Tune.Feedback.STATE_RELAY) == ""
@@ -261,6 +262,12 @@ def test_controllers_are_off_until_the_relay_ends_and_no_longer(is_open: bool) -
         assert manager.active == {"pid"}
         assert why_over(Tune.Feedback.STATE_COMPLETED) == ""
     assert given == ["command", "references"] * is_open
+    # relay_node is lost, and the reference is where the relay had it.
+    given.clear()
+    with pytest.raises(LoopError), JointTune.opened(tune):
+        raise LoopError("relay_node has ended")
+    assert given == (["command", "references"] if is_open else ["references"])
+    assert manager.active == {"pid"}
 
 
 def test_a_joint_whose_controller_is_off_is_told_with_what_to_type() -> None:
