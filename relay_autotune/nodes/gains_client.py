@@ -54,6 +54,7 @@ _NOT_YET = (
     "nobody subscribes to",
     NONE_WAIT,
     AT_WORK,
+    "gains of before are being brought back",
 )
 
 
@@ -308,6 +309,8 @@ class GainsClient(LoopClient):
         try:
             result = self._verified(goal, new, tell, leave)
         except GoneError as error:
+            # Nobody is left who has it.
+            more = False
             raise GoneError(f"{error}; {self._taken_back(*there)}") from error
         finally:
             if more:
