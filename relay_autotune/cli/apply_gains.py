@@ -213,14 +213,15 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
             shown.clear()
         columns = width()
         try:
-            present = client.in_force()
+            now = client.in_force()
             unproven = not result.passed and new is not None and client.has(new)
             lines = verdict_lines(
-                result, present, columns, stays=options.stays, noise_std=noise, unproven=unproven
+                result, now, columns, stays=options.stays, noise_std=noise, unproven=unproven
             )
         except LoopError as error:
             lines = found_lines(result, columns, noise)
-            lines += labelled("gains in force", f"not known: {error}", columns)
+            told = f"not known: {error}; before the proof: {_numbers(present)}"
+            lines += labelled("gains in force", told, columns)
         print("\n".join(lines))
     return DONE if result.passed else NOTHING_FOUND
 
@@ -298,14 +299,18 @@ def verdict_lines(
     :param noise_std: of the measurement [y]; NaN: not known.
     :param unproven: True if the gains in force are new ones that have not passed.
     """
-    now = "none, the command is held"
-    if present is not None:
-        now = ", ".join(f"{n} {digits(getattr(present, n))}" for n, _ in _FIGURES[:3])
+    now = _numbers(present)
     if result.passed and stays:
         now += f"; {PROGRAM} --revert takes those before"
     if unproven:
         now += "; these are the new ones, which are not proven: set those before yourself"
     return found_lines(result, columns, noise_std) + labelled("gains in force", now, columns)
+
+
+def _numbers(gains: Controller | None) -> str:
+    if gains is None:
+        return "none, the command is held"
+    return ", ".join(f"{n} {digits(getattr(gains, n))}" for n, _ in _FIGURES[:3])
 
 
 def found_lines(result: Any, columns: int, noise_std: float = math.nan) -> list[str]:

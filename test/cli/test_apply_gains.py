@@ -170,7 +170,8 @@ def test_new_gains_that_could_not_be_taken_back_are_told_as_such(
     present[:] = [Controller(0.1, 3.0)]
     client = client_of(lambda *words: present.append(None) or failed, lambda: gone(present))
     assert apply_gains.apply_and_verify(client, given) == 1
-    assert "gains in force not known: it is gone" in " ".join(capsys.readouterr().out.split())
+    told = " ".join(capsys.readouterr().out.split())
+    assert "gains in force not known: it is gone; before the proof: kc 0.1000, ti 3.000" in told
 
 
 def gone(present: list[Any]) -> Any:

@@ -156,3 +156,20 @@ def test_a_proof_by_command_that_is_cut_short_leaves_the_gains_of_before(
     assert loop.values() == BEFORE
     last = command.log.strip().splitlines()[-1]
     assert "/pid_controller has gains.heater" in last, command.log
+
+
+def test_a_loop_that_falls_silent_in_a_verification_gets_its_gains_back(rig: Rig) -> None:
+    """As where a controller of ros2_control is deactivated: its parameters are still there."""
+    loop = Loop(rig)
+    setpoint = rig.node.create_publisher(Float64, "setpoint", 10)
+    rig.until(lambda: setpoint.get_subscription_count() == 3, "both controllers")
+    setpoint.publish(Float64(data=5.0))
+    loop.apply(0.5, 1.6, 2.0)
+    rig.run_for(0.5)
+    (plant,) = [p for p in rig.processes if p.name == "plant_node"]
+    in_a_step(loop, lambda: plant.signal(signal.SIGSTOP))
+    rig.until(lambda: loop.values() == BEFORE, "the gains of before")
+    rig.until(lambda: loop.setpoints[-1].data == 5.0, "the set-point")
+    # They wait to be tried again.
+    rig.until(lambda: loop.trigger("apply").success, "the gains that wait")
+    plant.signal(signal.SIGCONT)

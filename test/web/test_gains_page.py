@@ -25,7 +25,7 @@ CALM = Wish("apply", 0, Asked(controller="pi", ms=1.3), 0.0)
 def sent(subject, wish):
     """Return the message with the gains that a wish means."""
     page = SimpleNamespace(subjects=[subject])
-    return GainsPage(None, Live("/relay_node"), page, 0, lambda: False)._message(wish)[0]
+    return GainsPage(None, Live("/relay_node"), page, 0, lambda: False)._message(wish)
 
 
 def test_the_gains_are_those_that_the_page_shows():
