@@ -169,7 +169,7 @@ class AfterTune:
             return self._nothing_started()
         if not options.json:
             paint = Paint(colour=wants_colour(sys.stdout.isatty(), os.environ))
-            left = self.left() if self._is_new else ""
+            left = self.left() if self._is_new else self.joint.left() if self.joint else ""
             lines = result_lines(result, client.cancelled, paint, width(), left)
             print("\n".join(lines), flush=True)
         flags, report = self._reported()
@@ -250,6 +250,9 @@ class AfterTune:
             told = "the --at at which it rests, a smaller --amplitude, or wider --within"
             return [("once it rests", f"start again with {told}")]
         steps = [("run it again", again)]
+        with suppress(RelayAutotuneError):
+            if self.joint is not None and (typed := self.joint.activation()):
+                return [("activate its controller", typed), *steps]
         if result.reason.startswith("no measurement on "):
             topic = result.reason.split()[3]
             told = f"the sensor (ros2 topic hz {topic}) and the load of the machine (uptime)"
@@ -334,7 +337,7 @@ class AfterTune:
         if joint is not None and joint.applies:
             assert self.nodes is not None
             print()
-            proven = joint.apply(self.nodes, written.doubt) == DONE
+            proven = joint.apply(self.client, self.nodes, written.doubt) == DONE
         return proven, steps
 
     def _asked(self, first: _Written, against: str) -> tuple[_Written, str]:
@@ -463,10 +466,8 @@ class AfterTune:
         :param against: what speaks against the gains; empty: nothing.
         """
         assert self.nodes is not None
-        try:
-            self.nodes.require_alive()
-        except RelayAutotuneError as error:
-            say(PROGRAM, f"{error}: the last command stays in force; see to the plant")
+        if why := self.nodes.why_lost():
+            say(PROGRAM, f"{why}: the last command stays in force; see to the plant")
             return
         then = (
             "do not start a controller with these gains, they are not proven"
@@ -572,17 +573,11 @@ class _Proof:
             try:
                 with Working(f"starting {name}"):
                     loop.find(START_WITHIN)
-                    nodes.require_alive()
                 patience = max(_TIMES_SETTLING * self._settles, _REST_WITHIN)
                 with (
                     loop.offered(client.result.gains) as gains,
-                    noted(lambda text: say(PROGRAM, text)) as came,
+                    noted(lambda text: say(PROGRAM, text)) as leave,
                 ):
-
-                    def leave() -> bool:
-                        nodes.require_alive()
-                        return came()
-
                     found = loop.prove(step, 0.0, patience, shown, leave, gains)
                     loop.let_settle(self._settles, shown, "the loop goes back", leave)
             finally:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +42,7 @@ from relay_autotune.text import digits, duration
 if TYPE_CHECKING:
     from relay_autotune.loop.gains import Controller, Gains, Performance
     from relay_autotune.nodes.gains_client import GainsClient
+    from relay_autotune.nodes.loop_client import LoopClient
     from relay_autotune.process.transfer_function import TransferFunction
 
 PROGRAM = "apply_gains"
@@ -128,38 +129,36 @@ def _work(options: argparse.Namespace, graph: ExitStack) -> int:
     return apply_and_verify(client, options)
 
 
-def apply_at(
-    name: str, *, doubtful: bool, yes: bool, patience: float, alive: Callable[[], object]
-) -> int:
+def apply_at(name: str, beside: LoopClient, *, doubtful: bool, yes: bool, patience: float) -> int:
     """Offer the newest gains to a controller_node that ends with this command.
 
     :param name: its full name.
+    :param beside: a client of its loop.
     :param doubtful: True: also gains whose verdict is not trusted.
     :param yes: True: do not ask.
     :param patience: how long to look for it [s].
-    :param alive: raises LoopError if it has ended.
     :return: the exit status.
     """
     from relay_autotune.nodes.gains_client import GainsClient
 
-    namespace, _, node = name.rpartition("/")
     options = _parser().parse_args(["--accept-doubtful"] if doubtful else [])
     options.yes, options.stays = yes, False
-    with GainsClient(namespace, node) as client:
+    with GainsClient("", name, beside) as client:
         with Working(f"looking for {name}"):
             client.find(patience)
-        return apply_and_verify(client, options, alive)
+        return apply_and_verify(client, options)
 
 
 def _write(client: GainsClient, options: argparse.Namespace) -> int:
-    from relay_autotune.exchange.export import WITHOUT_LAW, Target, exported, exports_of
+    from relay_autotune.exchange.export import Target, exported, exports_of
+    from relay_autotune.loop.laws import LAWS
 
     gains, doubt = client.waiting()
     _require_trust(doubt, options)
     how = exports_of(gains.law)[0]
     write(exported(gains, how, Target(), doubt=doubt), options.file)
     load = f"; load it with ros2 param load /pid_controller {options.file}"
-    print(f"written for {how}: {options.file}{load if how == WITHOUT_LAW else ''}")
+    print(f"written for {how}: {options.file}{load if LAWS[how].sets_gains else ''}")
     return DONE
 
 
@@ -170,16 +169,11 @@ def _require_trust(doubt: str, options: argparse.Namespace) -> None:
         )
 
 
-def apply_and_verify(
-    client: GainsClient,
-    options: argparse.Namespace,
-    alive: Callable[[], object] = lambda: None,
-) -> int:
+def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
     """Show the gains, ask, apply and verify them; return the exit status.
 
     :param client: of the controller_node, which was found.
     :param options: as the command line gives them.
-    :param alive: raises LoopError if the controller_node has ended.
     """
     with Working("asking for the gains"):
         present, model, noise = client.in_force(), client.model(), client.noise()
@@ -212,12 +206,7 @@ def apply_and_verify(
         return DONE
     shown = StatusLine()
     new = None if options.verify_only else gains
-    with noted(lambda text: say(PROGRAM, text)) as came:
-
-        def leave() -> bool:
-            alive()
-            return came()
-
+    with noted(lambda text: say(PROGRAM, text)) as leave:
         try:
             result = client.prove(step, options.load, options.wait, shown, leave, new)
         finally:

@@ -121,10 +121,10 @@ def _watch(nodes: OwnNodes, output: Path) -> tuple[Path, Any]:
 
     deadline = time.monotonic() + _DEADLINE
     with LoopClient("onlooker", "", "relay_node") as client:
+        client.why_lost = nodes.why_lost
 
         def wait(condition: Callable[[], object]) -> None:
             while not client.wait(lambda: bool(condition()), _LOOK_EVERY):
-                nodes.require_alive()
                 if time.monotonic() > deadline:
                     raise DemoError(
                         f"the tune took longer than {_DEADLINE:g} s; the logs are in {output}"
@@ -140,7 +140,7 @@ def _watch(nodes: OwnNodes, output: Path) -> tuple[Path, Any]:
         print(f"  accepted: experiment {answer.experiment_id}", flush=True)
         _show_cycles(seen, wait)
         wait(lambda: seen.gains)
-        wait(lambda: "is closed" in nodes.log())
+        wait(lambda: "is closed" in nodes.log("relay_node"))
         return output / "records" / answer.experiment_id, seen.gains[-1]
 
 

@@ -22,6 +22,7 @@ from relay_autotune.cli.own_nodes import (
     PROGRAM,
     START_WITHIN,
     OwnNodes,
+    namespace_of_joint,
     own_namespace,
     own_node,
     ranges,
@@ -35,10 +36,10 @@ from relay_autotune.exchange.messages import gains_from_message, transfer_functi
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.gains_place import controller_of
 from relay_autotune.nodes.live_types import CommandMessage, message_class
+from relay_autotune.nodes.loop_client import GoneError, LoopClient
 from relay_autotune.nodes.readiness import ChecklistLine, Mark
 from relay_autotune.nodes.ros2_control import (
     COMMAND_TYPE,
-    GAINS,
     STATE_TYPE,
     ControllerManager,
     ManagedController,
@@ -50,10 +51,13 @@ from relay_autotune.nodes.ros2_control import (
     told,
 )
 from relay_autotune.nodes.tune_client import TuneClient
+from relay_autotune_msgs.action import Tune
 
-_JOINT_STATES = "/joint_states"
+_JOINT_STATES = "joint_states"
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _FLOATS = "std_msgs/msg/Float64MultiArray"
+# How long to wait for a manager that may be gone [s].
+_PATIENCE = 2.0
 # Height of the trajectory that verifies gains by hand, as a part of the joint's range.
 _PROOF = 0.05
 
@@ -61,19 +65,23 @@ _PROOF = 0.05
 class JointTune:
     """A joint that is to be tuned.
 
-    :param client: a node of the graph.
-    :param options: with the flags of `add_joint` and `add_new_loop`.
+    :param client: a node of the graph; it goes on where a node of this command is lost.
+    :param options: with the flags of `add_joint` and `add_new_loop`; the namespace of the nodes is
+        set in it.
     :raises LoopError: if the loop is not there, or something is not known and nobody can be asked.
     """
 
-    def __init__(self, client: TuneClient, options: argparse.Namespace) -> None:
+    def __init__(self, client: LoopClient, options: argparse.Namespace) -> None:
         self._client, self._options = client, options
-        self._space = own_namespace(options)
         self._forward: ManagedController | None = None
         self._former: tuple[str, ...] = ()
         with Working(f"looking at {options.controller}"):
-            self._manager = ControllerManager(client, options.controller_manager, options.wait)
-            self._loop = joint_loop(client, self._manager, options.controller, options.joint)
+            space, slash, controller = options.controller.rpartition("/")
+            within = f"/{space.strip('/')}".rstrip("/") if slash else None
+            self._manager = ControllerManager(
+                client, options.controller_manager, within, options.wait
+            )
+            self._loop = joint_loop(client, self._manager, controller, options.joint)
             if options.open:
                 loaded = self._manager.controllers()
                 self._forward = forwarding(
@@ -82,6 +90,9 @@ class JointTune:
                 self._former = in_the_way(loaded, self._forward.needs)
                 self._held = self._commands_beside(self._forward)
         loop = self._loop
+        if not options.namespace:
+            options.namespace = namespace_of_joint(loop.node, loop.joint)
+        self._space = own_namespace(options)
         if loop.why_not_moved and not options.open:
             raise LoopError(f"{loop.controller} stays as it is: {self._why_not_closed()}")
         if not options.open and not math.isfinite(loop.state.reference):
@@ -95,7 +106,7 @@ class JointTune:
             self._within, self._within_from = list(loop.within), "robot_description"
         if self._within is None:
             what = f"lowest and highest {loop.measured} that {loop.joint} may have [y]"
-            self._within = asked(what, "--within", "", "-5 5", pair_of)
+            self._within, self._within_from = asked(what, "--within", "", "-5 5", pair_of), "typed"
         self._baseline = loop.state.output if options.at is None else options.at
         if options.open and not math.isfinite(self._baseline):
             what = f"present {loop.commanded} of {loop.joint}, at which it rests [u]"
@@ -145,7 +156,11 @@ class JointTune:
         return list(map(str, lines))
 
     def show(self) -> None:
-        """Print the plan."""
+        """Print the plan, some seconds after the first look.
+
+        :raises LoopError: if another robot was found meanwhile, which may be the one meant.
+        """
+        self._manager.require_alone()
         print("\n".join(check_lines(self.plan(), width())), file=sys.stderr, flush=True)
 
     def _moves(self) -> Iterator[tuple[str, str]]:
@@ -186,8 +201,8 @@ class JointTune:
 
     @property
     def _places(self) -> str:
-        first, *others = self._loop.parameters
-        return "/".join([first, *(name[-1] for name in others)])
+        first, *others = self._loop.places.values()
+        return "/".join([first, *(name.rpartition(".")[2] for name in others)])
 
     def _notes(self) -> Iterator[tuple[str, str]]:
         """Say what the controller's settings do to the gains."""
@@ -199,12 +214,8 @@ class JointTune:
             "antiwindup",
             {
                 "back_calculation": "back_calculation: at a u_clamp the integral gives way within "
-                + (
-                    f"tracking_time_constant {loop.tracking_time_constant:g} s, which stays"
-                    if loop.tracking_time_constant
-                    else "a time that follows from the new gains"
-                )
-                + limited,
+                "tracking_time_constant, which is set with the gains: sqrt(d/i), without "
+                "derivative action p/i" + limited,
                 "conditional_integration": "conditional_integration: no integration at a u_clamp"
                 + limited,
                 "none": "none: the integral winds up at a limit of the command",
@@ -299,7 +310,7 @@ class JointTune:
         assert self._forward is not None
         loop, options, client = self._loop, self._options, self._client
         kind, field = _JOINT_STATE, f"{loop.measured}[{loop.joint}]"
-        topic = options.measurement or _JOINT_STATES
+        topic = options.measurement or self._manager.node_of(_JOINT_STATES)
         found = client.kind_of(topic, options.wait, published=True)
         if options.measurement and options.field != "data":
             kind, field = found, options.field
@@ -377,30 +388,44 @@ class JointTune:
 
     def _position_of(self, joint: str) -> float:
         kind = message_class(_JOINT_STATE, "measurement_type")
-        for message in self._client.heard(kind, _JOINT_STATES, 0.0, 1):
+        for message in self._client.heard(kind, self._manager.node_of(_JOINT_STATES), 0.0, 1):
             if joint in message.name:
                 return float(message.position[list(message.name).index(joint)])
         return math.nan
 
     @contextmanager
-    def opened(self) -> Iterator[Callable[[], str]]:
-        """Open the loop for a tune if that is asked for, and close it however the tune ends.
+    def opened(self) -> Iterator[Callable[[int], str]]:
+        """Open the loop for a tune if that is asked for, and close it as soon as the relay ends.
 
-        :return: what tells why the tune has to end; empty: it goes on.
+        :return: to be told the state of the tune at each look, tells why the tune has to end;
+            empty: it goes on.
         """
-        if self._forward is None:
-            yield self._manager.still_active(self._loop.controller)
-            return
-        try:
-            # Controllers that command 0 when they are switched off leave it to the next one.
-            with ExitStack() as stack:
+        loop, forward = self._loop, self._forward
+        # It is closed with the block, however that ends.
+        with ExitStack() as stack:
+            if forward is not None:
+                # Controllers that command 0 when they are switched off leave it to the next one.
                 with self._client.publishing(*self._first_command()) as command:
-                    stack.enter_context(Opened(self._manager, self._forward.name, self._former))
+                    opened = Opened(
+                        self._manager, forward.name, self._former, self._give_references_back
+                    )
+                    stack.enter_context(opened)
                     command()
-                yield self._manager.still_active(self._forward.name)
-        finally:
-            if why := self._why_no_references():
-                say(PROGRAM, why)
+            why_lost = self._manager.still_active(forward.name if forward else loop.controller)
+
+            def why_over(state: int) -> str:
+                if state <= Tune.Feedback.STATE_RELAY:
+                    return why_lost()
+                stack.close()
+                return ""
+
+            try:
+                yield why_over
+            except LoopError:
+                # A node that is lost leaves the reference where the relay had it.
+                if forward is None:
+                    self._put_back()
+                raise
 
     def _first_command(self) -> tuple[Any, str]:
         """Return the message of the first command, and its topic."""
@@ -409,18 +434,23 @@ class JointTune:
         message = CommandMessage(values["command_type"], values["command_field"], beside)
         return message.written(self._baseline), topics["command"]
 
-    def _why_no_references(self) -> str:
-        """Publish the references of before, which the controller forgets when it is switched.
+    @property
+    def left_behind(self) -> str:
+        """What follows where relay_node is lost during a tune."""
+        what = "the controllers" if self._forward else "the reference"
+        return f"{self._loop.joint} gets back {what} of before"
 
-        :return: why it does not have them; empty: it has, or it cannot.
-        """
-        loop = self._loop
-        active = False
+    def _put_back(self) -> None:
+        """Give the references back, if the controller that takes them is active."""
         with suppress(LoopError):
-            listed = self._manager.controllers()
-            active = any(each.name == loop.controller and each.is_active for each in listed)
-        if loop.why_not_moved or not active:
-            return ""
+            if not self.activation():
+                self._give_references_back()
+
+    def _give_references_back(self) -> None:
+        """Publish the references of before, which the controller forgets when it is switched."""
+        loop = self._loop
+        if loop.why_not_moved:
+            return
         reference = loop.state.reference
         commands = CommandMessage(COMMAND_TYPE, loop.reference_field, loop.references)
         states = message_class(STATE_TYPE, "measurement_type")
@@ -432,18 +462,40 @@ class JointTune:
         if math.isfinite(reference) and not self._client.publish(
             commands.written(reference), loop.reference_topic, states, loop.state_topic, is_back
         ):
-            return (
+            say(
+                PROGRAM,
                 f"{loop.controller} is active again, but does not take its former reference "
-                f"{reference:g} for {loop.joint}: publish it on {loop.reference_topic}"
+                f"{reference:g} for {loop.joint}: publish it on {loop.reference_topic}",
             )
-        return ""
+
+    def activation(self) -> str:
+        """Return what to type so that its controller is active; empty: it is.
+
+        :raises LoopError: if the manager does not answer.
+        """
+        name = self._loop.controller
+        listed = self._manager.controllers(_PATIENCE)
+        active = any(each.name == name and each.is_active for each in listed)
+        return "" if active else self._manager.command_for([name], [])
+
+    def left(self) -> str:
+        """Return in which state the joint is."""
+        loop = self._loop
+        stays = f"{loop.joint} has the last {loop.commanded} that it got"
+        try:
+            if self.activation():
+                return f"{loop.controller} is not active: {stays}"
+        except LoopError as error:
+            return f"{error}: {stays}, or what its hardware does without a manager"
+        what = loop.why_not_moved or f"the reference of {loop.joint} is that of before"
+        return f"{loop.controller} is active, {what}"
 
     # The gains.
 
     @property
     def target(self) -> Target:
         """Where exported gains go."""
-        return Target(self._loop.node, self._loop.dof)
+        return Target(self._loop.node, self._loop.dof, is_set_up=True)
 
     @property
     def applies(self) -> bool:
@@ -455,12 +507,15 @@ class JointTune:
 
         :raises LoopError: if it does not answer.
         """
-        p, i, d = self._client.values(self._loop.node, self._loop.parameters).values()
-        return controller_of({"p": p, "i": i, "d": d}) if p else None
+        places = self._loop.places
+        values = self._client.values(self._loop.node, list(places.values()))
+        found = {gain: values[place] for gain, place in places.items()}
+        return controller_of(found) if found["p"] else None
 
-    def apply(self, nodes: OwnNodes, doubt: str) -> int:
+    def apply(self, client: TuneClient, nodes: OwnNodes, doubt: str) -> int:
         """Offer the gains to the controller, verify them, and return the exit status.
 
+        :param client: with the result of the tune.
         :param nodes: of this command.
         :param doubt: why they are doubtful; empty: they are trusted.
         """
@@ -468,8 +523,8 @@ class JointTune:
             raise LoopError(f"the gains are doubtful, so that --yes does not apply them: {doubt}")
         loop = self._loop
         if loop.why_not_moved:
-            return self._set()
-        places = ",".join(map("{}:{}".format, GAINS, loop.parameters))
+            return self._set(client)
+        places = ",".join(map("{}:{}".format, *zip(*loop.places.items(), strict=True)))
         topics, values = self._at_controller()
         values |= {
             "apply_to": loop.node,
@@ -482,22 +537,28 @@ class JointTune:
                 values[name] = clamp
         # Not before, since relay_node refuses a second publisher of the reference.
         nodes.start("controller_node", ros_arguments(self._space, topics, values))
-        return apply_at(
-            own_node(self._options, "controller_node"),
-            doubtful=bool(doubt),
-            yes=self._options.yes,
-            patience=START_WITHIN,
-            alive=nodes.require_alive,
-        )
+        try:
+            return apply_at(
+                own_node(self._options, "controller_node"),
+                client,
+                doubtful=bool(doubt),
+                yes=self._options.yes,
+                patience=START_WITHIN,
+            )
+        except GoneError:
+            # It would have taken its step back.
+            nodes.end("controller_node")
+            self._put_back()
+            raise
 
-    def _set(self) -> int:
+    def _set(self, tuned: TuneClient) -> int:
         """Set the gains of a controller whose references nobody can move; return the status."""
         loop, client = self._loop, self._client
-        found = client.result
+        found = tuned.result
         gains = gains_from_message(found.gains)
         model = transfer_function_from_message(found.transfer_function)
-        before = client.values(loop.node, loop.parameters)
-        wanted = {name: float(getattr(gains, name[-1])) for name in loop.parameters}
+        before = client.values(loop.node, list(loop.places.values()))
+        wanted = {place: float(getattr(gains, name)) for name, place in loop.places.items()}
         print("\n".join(beside(self.present(), gains, model)))
         question = f"Set {self._places} of {loop.node}, without a step that verifies them?"
         if not agrees(question, yes=self._options.yes):

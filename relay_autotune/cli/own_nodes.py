@@ -27,12 +27,12 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from relay_autotune.bag.field_path import first_numbers
 from relay_autotune.cli.arguments import finite
 from relay_autotune.cli.terminal import Working, asked, broken, number_of, pair_of, width
-from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
+from relay_autotune.errors import ParameterError, RelayAutotuneError, SelectionError
 from relay_autotune.exchange.export import number
 from relay_autotune.loop.laws import LAWS
 
@@ -44,19 +44,32 @@ if TYPE_CHECKING:
 _END_WITHIN = 8.0
 # prctl's request that a process gets a signal when its parent ends.
 _PR_SET_PDEATHSIG = 1
+# What stands before the text in a line of a node's log, and in the one of its program.
+_PREFIX = re.compile(r"\[[A-Z]+\] \[[0-9.]+\] \[\S+\]: |\w+_node: ")
 
 
 def own_namespace(options: argparse.Namespace) -> str:
-    """Return the namespace of the nodes: that of the flag, else one of this process alone.
+    """Return the namespace of the nodes: that of the flag, else one of this process alone."""
+    return str(options.namespace or f"tune_loop_{os.getpid()}")
 
-    For a joint it is the same each time, so that the next tune of it puts right what a loss of
-    power has left of a verification.
+
+def namespace_of_joint(controller: str, joint: str) -> str:
+    """Return the namespace of the nodes that tune a joint, which no other joint has.
+
+    It is the same each time, so that the next tune puts right what a loss of power has left of a
+    verification.
+
+    :param controller: full name of the controller's node.
+    :param joint: name of the joint, any text.
     """
-    if options.namespace:
-        return str(options.namespace)
-    if options.joint:
-        return re.sub(r"\W", "_", f"tune_{options.controller}_{options.joint}")
-    return f"tune_loop_{os.getpid()}"
+    # Characters that a name cannot have, as two underscores in a row, stand as _x, their number
+    # and z. So does an underscore that would begin such a text.
+    escaped = re.sub(
+        r"[^0-9A-Za-z_]|_(?![0-9A-Za-z])|_(?=x[0-9a-f]+z)",
+        lambda found: f"_x{ord(found[0]):x}z",
+        f"_{joint}",
+    )
+    return f"{controller}/tune{escaped}"
 
 
 def own_node(options: argparse.Namespace, name: str) -> str:
@@ -116,7 +129,7 @@ class OwnNodes:
     def __init__(self, nodes: Mapping[str, Sequence[str]] = MappingProxyType({})) -> None:
         self._nodes = nodes
         self._running: dict[str, subprocess.Popen[bytes]] = {}
-        self._log = tempfile.TemporaryFile()  # noqa: SIM115  it is closed at the end of the block
+        self._logs: dict[str, IO[bytes]] = {}
 
     def __enter__(self) -> OwnNodes:
         for name, arguments in self._nodes.items():
@@ -132,20 +145,25 @@ class OwnNodes:
         # Loaded before the fork: after it only few calls are allowed.
         prctl = ctypes.CDLL(None).prctl
         run = f"from relay_autotune.start import {name}; raise SystemExit({name}())"
+        log = tempfile.TemporaryFile()  # noqa: SIM115  it is closed at the end of the block
+        self._logs[name] = log
         self._running[name] = subprocess.Popen(
             [sys.executable, "-c", run, "--ros-args", *arguments],
             stdin=subprocess.DEVNULL,
-            stdout=self._log,
+            stdout=log,
             stderr=subprocess.STDOUT,
             start_new_session=True,
             preexec_fn=lambda: prctl(_PR_SET_PDEATHSIG, signal.SIGTERM),
         )
         return self._running[name].pid
 
-    def log(self) -> str:
-        """Return what the nodes have logged."""
-        file = self._log.fileno()
-        # A plain read would move the place at which the nodes write.
+    def log(self, name: str) -> str:
+        """Return what a node has logged.
+
+        :param name: of its executable.
+        """
+        file = self._logs[name].fileno()
+        # A plain read would move the place at which the node writes.
         return os.pread(file, os.fstat(file).st_size, 0).decode(errors="replace")
 
     def arguments(self, name: str) -> Sequence[str]:
@@ -164,20 +182,23 @@ class OwnNodes:
             with Working(f"ending {name}"):
                 _end([process])
 
-    def require_alive(self) -> None:
-        """Refuse to go on without a node.
+    def why_lost(self, only: str = "") -> str:
+        """Return which of them has ended by itself, with its last line; empty: none has.
 
-        :raises LoopError: with its last line, if one of them has ended.
+        :param only: the one that is looked at; empty: all.
         """
         for name, process in self._running.items():
-            if process.poll() is not None:
-                lines = self.log().strip().splitlines()
-                raise LoopError(f"{name} has ended: {lines[-1] if lines else 'without a word'}")
+            if only in ("", name) and (status := process.poll()) is not None:
+                by = f" ({signal.strsignal(-status)})" if status < 0 else ""
+                lines = self.log(name).strip().splitlines() or ["without a word"]
+                return f"{name} has ended{by}: {_PREFIX.sub('', lines[-1])}"
+        return ""
 
     def __exit__(self, *_: object) -> None:
         with Working("ending the nodes"):
             _end(self._running.values())
-        self._log.close()
+        for log in self._logs.values():
+            log.close()
 
 
 def _end(processes: Collection[subprocess.Popen[bytes]]) -> None:
@@ -305,7 +326,11 @@ _OF_NEW_LOOP: dict[str, dict[str, Any]] = {
         "default": False, "action": "store_true",
         "help": "do not ask, for scripts; gains are then proven with --verify alone",
     },
-    "export": {"metavar": "FILE", "help": "write the gains for ros2_controllers' pid_controller"},
+    "export": {
+        "metavar": "FILE",
+        "help": "write the gains for ros2_controllers' pid_controller, or for the controller of "
+        "the joint; an existing file is refused at once",
+    },
 }  # fmt: skip
 
 # Flags of a loop without nodes that a joint takes with --open alone, and those it never takes.
@@ -359,7 +384,8 @@ def add_joint(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--controller", metavar="NAME",
-        help="an active pid_controller, or with --open a joint_trajectory_controller",
+        help="an active pid_controller, or with --open a joint_trajectory_controller; of several "
+        "robots with its namespace, such as /robot1/wheel_pid",
     )  # fmt: skip
     group.add_argument("--joint", metavar="NAME", help="the joint, or degree of freedom")
     group.add_argument(

@@ -140,6 +140,19 @@ def in_columns(rows: Sequence[Sequence[str]], columns: int) -> list[str]:
     ]
 
 
+def require_new(path: str) -> None:
+    """Refuse a file that `write` could not write, before any work is done.
+
+    :param path: the file.
+    :raises SelectionError: if it exists already, or its folder is not there or not writable.
+    """
+    if Path(path).exists():
+        raise SelectionError(f"{path} exists already, not overwriting it")
+    folder = Path(path).parent
+    if not os.access(folder, os.W_OK):
+        raise SelectionError(f"{path} cannot be written: there is no writable folder {folder}")
+
+
 def write(text: str, path: str | None) -> None:
     """Write a file, or to standard output.
 

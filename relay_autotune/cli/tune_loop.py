@@ -19,13 +19,12 @@ import argparse
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from relay_autotune.cli.arguments import (
     NOTHING_FOUND,
-    USAGE,
     add_web,
     check_web,
     finite,
@@ -43,13 +42,16 @@ from relay_autotune.cli.own_nodes import (
     own_namespace,
     with_flags,
 )
-from relay_autotune.cli.terminal import Help, Working, agrees, width
+from relay_autotune.cli.terminal import Help, Working, agrees, require_new, width
 from relay_autotune.cli.tune_view import TICK, Shown, check_lines, follow
-from relay_autotune.errors import ParameterError
+from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
 
 if TYPE_CHECKING:
+    from relay_autotune.nodes.loop_client import LoopClient
     from relay_autotune.nodes.tune_client import TuneClient
+
+_Client = TypeVar("_Client", bound="LoopClient")
 # Parts of the checklist's lines on rest while few samples have come, and on the model while
 # identifier_node is not discovered.
 NOT_KNOWN_YET, NO_MODEL = "not known yet", "no identifier_node"
@@ -150,52 +152,58 @@ def _tune(options: argparse.Namespace, ros: list[str], graph: ExitStack) -> int:
     heed(signal.SIGINT)
     # Imported here, so that --help does not load rclpy.
     from relay_autotune.nodes.lifetime import ending_signals, never_wait_for
+    from relay_autotune.nodes.loop_client import LoopClient
     from relay_autotune.nodes.tune_client import TuneClient
 
     if options.report:
         from relay_autotune.cli.report import check_output
 
         check_output(PROGRAM, options.report)
+    if options.export:
+        require_new(options.export)
     if options.web:
         check_web(options)
     of_joint = is_of_joint(options)
-    if of_joint:
-        from relay_autotune.cli.joint_tune import JointTune
     new = of_joint or is_new_loop(options)
-    try:
-        namespace = own_namespace(options) if new else options.namespace
-        spaces = namespace.split(",") if options.web else [namespace]
-        with Working("joining the ROS graph"):
-            clients = [
-                graph.enter_context(TuneClient(space, options.node, ros)) for space in spaces
-            ]
-    except ParameterError as error:
-        say(PROGRAM, str(error))
-        return USAGE
-    client = clients[0]
+    def joined(kind: Callable[..., _Client], *arguments: Any) -> _Client:
+        try:
+            with Working("joining the ROS graph"):
+                found = kind(*arguments)
+        except ParameterError as error:
+            raise SelectionError(str(error)) from None
+        graph.enter_context(found)
+        return found
+
     with ExitStack() as stack:
-        patience, joint, nodes = options.wait, None, None
+        patience, robot, joint, nodes = options.wait, None, None, None
+        if of_joint:
+            from relay_autotune.cli.joint_tune import JointTune
+
+            robot = joined(LoopClient, own_namespace(options), "", options.node, ros)
         if new:
             # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.
             signal.signal(signal.SIGINT, signal.default_int_handler)
             if interrupted:
                 raise KeyboardInterrupt
-            joint = JointTune(client, options) if of_joint else None
+            joint = JointTune(robot, options) if robot else None
+        namespace = own_namespace(options) if new else options.namespace
+        spaces = namespace.split(",") if options.web else [namespace]
+        clients = [joined(TuneClient, space, options.node, ros, robot) for space in spaces]
+        client = clients[0]
+        if new:
             nodes = stack.enter_context(joint.nodes() if joint else nodes_for(client, options))
+            client.why_lost = nodes.why_lost
+            if joint:
+                client.left_behind = joint.left_behind
             patience = max(patience, START_WITHIN)
         deadline = time.monotonic() + patience
-
-        def leave() -> bool:
-            if nodes is not None:
-                nodes.require_alive()
-            return bool(interrupted)
 
         for each in clients:
             with Working(f"{'starting' if new else 'looking for'} {each.name}"):
                 each.find(
                     patience,
                     needs_identifier=not (options.dry_run or options.record_only),
-                    leave=leave,
+                    leave=lambda: bool(interrupted),
                 )
         if joint:
             joint.show()
@@ -220,7 +228,12 @@ def _tune(options: argparse.Namespace, ros: list[str], graph: ExitStack) -> int:
         wait_again = never_wait_for(sys.stderr.fileno())
         opens = joint is not None and not options.dry_run
         try:
-            with joint.opened() if joint and opens else nullcontext(lambda: "") as why_over:
+            with joint.opened() if joint and opens else nullcontext(lambda _: "") as left:
+
+                def why_over(state: int) -> str:
+                    # A relay_node that is lost cannot be asked to end the tune.
+                    return left(state) or (nodes.why_lost("identifier_node") if nodes else "")
+
                 while True:
                     client.ask(options.amplitude, options.dry_run)
                     follow(client, shown, interrupted, why_over=why_over)

@@ -368,7 +368,7 @@ def follow(
     shown: Any,
     interrupted: list[int],
     tick: float = TICK,
-    why_over: Callable[[], str] = lambda: "",
+    why_over: Callable[[int], str] = lambda _: "",
 ) -> None:
     """Show the feedback until the result is there, and cancel when asked to.
 
@@ -376,15 +376,17 @@ def follow(
     :param shown: where the feedback goes, as :class:`Shown`.
     :param interrupted: signals that have come.
     :param tick: interval of the looks [s].
-    :param why_over: tells why the tune has to end by itself; empty: it goes on.
+    :param why_over: told the state of the tune at each look, tells why it has to end by itself;
+        empty: it goes on.
     """
-    asked = 0
+    asked = state = 0
     while not client.done():
         client.spin(tick)
         for feedback in client.news():
             shown.take(feedback)
+            state = feedback.state
         shown.tick()
-        over = why_over() if not asked else ""
+        over = why_over(state)
         if (interrupted or over) and not asked:
             asked = 1
             client.cancel()

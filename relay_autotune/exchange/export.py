@@ -25,19 +25,23 @@ _DIGITS = 10
 # Gains that are for no law in particular can be exported for this one.
 WITHOUT_LAW = "pid_controller"
 EXPORTS = (*LAWS, "yaml")
-_NAME = re.compile(r"[A-Za-z_]\w*\Z")
+_DOF = re.compile(r"[\w.-]+(/[\w.-]+)*\Z", re.ASCII)
+# Names that YAML reads as text without quotes.
+_PLAIN = re.compile(r"[A-Za-z_]\w*(/\w+)*\Z", re.ASCII)
 _NODE = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*\Z")
 
 
 @dataclass(frozen=True)
 class Target:
-    """Where gains for pid_controller go.
+    """Where gains for a controller of ros2_controllers go.
 
     :param node: name of the controller's node, with its namespace.
     :param dof: name of the degree of freedom, a key of the parameter `gains`.
     :param command_min: lower clamp of the command [u]; -inf: none.
     :param command_max: upper clamp of the command [u]; inf: none.
     :param present: the command at which the process rests [u]; NaN: not known.
+    :param is_set_up: True if the gains are for its rate and its strategy against windup, which a
+        joint_trajectory_controller cannot change while it runs.
     :raises SelectionError: if a name cannot be that of a node or parameter, or a clamp is NaN or
         above the other.
     """
@@ -47,11 +51,12 @@ class Target:
     command_min: float = -math.inf
     command_max: float = math.inf
     present: float = math.nan
+    is_set_up: bool = False
 
     def __post_init__(self) -> None:
         if not _NODE.match(self.node):
             raise SelectionError(f"{self.node!r} is not a node name, such as /pid_controller")
-        if not all(_NAME.match(part) for part in self.dof.split("/")):
+        if not _DOF.match(self.dof):
             raise SelectionError(
                 f"{self.dof!r} is not a name of a degree of freedom, such as heater or joint1"
             )
@@ -67,7 +72,7 @@ def exported(gains: Gains, how: str, target: Target, *, doubt: str = "") -> str:
 
     :param gains: what is to be loaded.
     :param how: a law of :data:`~relay_autotune.loop.laws.LAWS`, or "yaml".
-    :param target: for pid_controller: where they go.
+    :param target: for a controller of ros2_controllers: where they go.
     :param doubt: what to look at before they are used; empty: they are trusted.
     :raises SelectionError: if they are for another law.
     """
@@ -77,7 +82,8 @@ def exported(gains: Gains, how: str, target: Target, *, doubt: str = "") -> str:
         runs = gains.law or "controller_node, as a continuous controller"
         raise SelectionError(f"the gains are for {runs}: give --law {how} to export them for it")
     law = LAWS[how]
-    text = pid_controller(gains, target) if how == WITHOUT_LAW else settings(gains, law, target)
+    written = parameters if law.sets_gains else settings
+    text = written(gains, law, target)
     return _doubted(text, doubt, law.remark)
 
 
@@ -93,19 +99,22 @@ def _doubted(text: str, doubt: str, remark: str) -> str:
     return f"{remark} DOUBTFUL: {' '.join(doubt.split())}\n{text}" if doubt else text
 
 
-def pid_controller(gains: Gains, target: Target) -> str:
-    """Return parameters of ros2_controllers' pid_controller for one degree of freedom.
+def parameters(gains: Gains, law: Law, target: Target) -> str:
+    """Return parameters of a controller of ros2_controllers for one degree of freedom.
 
     The file holds only one node, since `ros2 param load` applies every section to the node that
     it is given. Infinite clamps are left out, since they would be read as text.
 
     :param gains: what is to be loaded.
+    :param law: that it runs.
     :param target: where they go.
     """
     clamps = (("u_clamp_max", target.command_max), ("u_clamp_min", target.command_min))
-    values = _values(gains, LAWS[WITHOUT_LAW])
+    stays = ("antiwindup_strategy",) if target.is_set_up else ()
+    values = [each for each in _values(gains, law) if each[0] not in stays]
+    told = (*_lacking(gains), *_signed(gains))
     lines = [
-        *_comments(gains, (*_lacking(gains), *_signed(gains)), "#"),
+        *_comments(gains, told, "#", known=target.is_set_up),
         f"# ros2 param load {target.node} FILE",
         f"{_key(target.node)}:",
         "  ros__parameters:",
@@ -197,22 +206,23 @@ def number(value: float) -> str:
 def _key(name: str) -> str:
     # YAML 1.1 reads these as booleans and as null.
     special = name.lower() in ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
-    return f"'{name}'" if special else name
+    return f"'{name}'" if special or not _PLAIN.match(name.lstrip("/")) else name
 
 
-def _comments(gains: Gains, more: Sequence[str], remark: str) -> list[str]:
+def _comments(gains: Gains, more: Sequence[str], remark: str, *, known: bool = False) -> list[str]:
     told = [
         f"Gains by the rule {gains.rule} of relay_autotune: Ms {gains.ms:.3g}, Mt {gains.mt:.3g}.",
         f"ISA form: kc {gains.kc:.6g} u/y, ti {gains.ti:.6g} s, td {gains.td:.6g} s, "
         f"tf {gains.tf:.6g} s, b {gains.b:g}.",
     ]
     if gains.law:
-        told += [
-            f"Designed for {gains.law} every {gains.law_period:.6g} s.",
-            "That is --sample-period, else the interval of the recording: give --sample-period "
-            "if the program runs at another.",
-        ]
-        if gains.law != OWN_LAW:
+        told.append(f"Designed for {gains.law} every {gains.law_period:.6g} s.")
+        if not known:
+            told.append(
+                "That is --sample-period, else the interval of the recording: give "
+                "--sample-period if the program runs at another."
+            )
+        if gains.law != OWN_LAW and not known:
             told.append(
                 f"controller_node proves them where its parameter law is {gains.law}; another "
                 f"proof of it was of other gains."

@@ -71,6 +71,14 @@ class Controller:
         """Derivative gain of the parallel form, kc td [u s/y]."""
         return self.kc * self.td
 
+    @property
+    def tracking(self) -> float:
+        """Time in which back-calculation draws the integral to a limit, sqrt(ti td) [s].
+
+        Without derivative action it is ti; 0: there is no integral.
+        """
+        return math.sqrt(self.ti * self.td) or self.ti
+
     def transfer_function(self) -> TransferFunction:
         """Return the controller from measurement to command, without its sign.
 

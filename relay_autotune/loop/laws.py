@@ -458,17 +458,6 @@ class LawRate:
         return self.law.at(self.law.best(gains, self.period), self.period)
 
 
-def _tracking(law: SampledLaw) -> float | None:
-    """Return the time constant that control_toolbox would use for 0.
-
-    It is written out, since versions of its documentation differ.
-    """
-    gains = law.gains
-    if gains.ti == 0.0:
-        return None
-    return math.sqrt(gains.ti * gains.td) if gains.td > 0.0 else gains.ti
-
-
 def _gains(
     names: str, fields: str = "p i d", of: Callable[[float], float] = lambda gain: gain
 ) -> tuple[Setting, ...]:
@@ -501,22 +490,24 @@ _ON_Y = "I_k = I_{k-1} + i h e_k, then u_k = p (b r_k - y_k) + I_k - d (y_k - y_
 
 
 def _control_toolbox(
-    strategy: str,
+    name: str,
     limits: str,
     *others: Setting,
     equation: str = _LATE,
     integral: Integral = Integral.AFTER,
 ) -> Law:
     """Return the law of control_toolbox with one of its anti-windup strategies."""
+    strategy = name.removeprefix("control_toolbox_")
     settings = (*_gains("p i d"), _strategy(strategy), *others)
-    name = f"control_toolbox_{strategy}"
     return Law(name, _TOOLBOX, equation, limits, settings, integral, Slope.ERROR)
 
 
 _BACK_CALCULATION = _control_toolbox(
-    "back_calculation",
+    "control_toolbox_back_calculation",
     "I also gets h (u limited - u)/tracking_time_constant",
-    Setting("tracking_time_constant", _tracking),
+    # That which control_toolbox takes for 0; written out, since a program that runs keeps the one
+    # of the gains before.
+    Setting("tracking_time_constant", lambda law: law.gains.tracking or None),
 )
 
 _ROWS = (
@@ -533,10 +524,12 @@ _ROWS = (
         form="ideal",
     ),
     _BACK_CALCULATION,
-    _control_toolbox("conditional_integration", "no integration while u is limited and e u > 0"),
-    _control_toolbox("none", "the integral winds up"),
     _control_toolbox(
-        "legacy",
+        "control_toolbox_conditional_integration", "no integration while u is limited and e u > 0"
+    ),
+    _control_toolbox("control_toolbox_none", "the integral winds up"),
+    _control_toolbox(
+        "control_toolbox_legacy",
         "I stays between i_clamp_min and i_clamp_max",
         equation=_EARLY,
         integral=Integral.BEFORE,

@@ -145,9 +145,8 @@ class PidLaw:
         part = self.proportional(c, setpoint)
         wanted = part + self.integral
         given = limits.clip(wanted)
-        tracking = math.sqrt(c.ti * c.td) or c.ti
-        if given != wanted and tracking > 0.0:
-            pull = min(1.0, interval / tracking)
+        if given != wanted and c.tracking > 0.0:
+            pull = min(1.0, interval / c.tracking)
             drawn = self.integral + pull * (given - wanted)
             # One sample moves the integral by at most `pull` times the range of the limits,
             room = pull * (limits.high - limits.low)

@@ -29,7 +29,7 @@ from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.gains_place import controller_of, mapping_of
-from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
+from relay_autotune.nodes.loop_client import ANSWER_WITHIN, GoneError, LoopClient
 from relay_autotune.nodes.tables import FIXED, GAINS, NONE_WAIT, rate_from
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
@@ -55,6 +55,7 @@ _NOT_YET = (
     "nobody subscribes to",
     NONE_WAIT,
     AT_WORK,
+    "gains of before are being brought back",
 )
 
 
@@ -303,20 +304,15 @@ class GainsClient(LoopClient):
         before = self.values(self.name, ("verify_step", "verify_step_max"))
         more = abs(setpoint) > max(map(abs, before.values()))
         there = self._there()
-
-        def leaves() -> bool:
-            try:
-                return leave()
-            except LoopError as error:
-                raise _GoneError(str(error)) from error
-
         goal = Verify.Goal(setpoint_step=setpoint, load_step=load, patience=patience)
         if more:
             self.set_values(self.name, {"verify_step_max": abs(setpoint)})
         try:
-            result = self._verified(goal, new, tell, leaves)
-        except _GoneError as error:
-            raise LoopError(f"{error}; {self._taken_back(*there)}") from error
+            result = self._verified(goal, new, tell, leave)
+        except GoneError as error:
+            # Nobody is left who has it.
+            more = False
+            raise GoneError(f"{error}; {self._taken_back(*there)}") from error
         finally:
             if more:
                 with suppress(LoopError):
@@ -335,6 +331,8 @@ class GainsClient(LoopClient):
         :param target: the other node; empty: there is none.
         :param before: its parameters.
         """
+        # Who is lost is no reason any longer to leave the rest undone.
+        self.why_lost = lambda: ""
         if not target:
             return (
                 "nobody controls the loop; started again, it begins with the gains that were "
@@ -423,13 +421,9 @@ class GainsClient(LoopClient):
                     goal.cancel_goal_async()
                     until = time.monotonic() + ANSWER_WITHIN
             if not self._verify.server_is_ready():
-                raise _GoneError(f"{self.name} has gone during the verification")
+                raise GoneError(f"{self.name} has gone during the verification")
             if time.monotonic() >= until:
-                raise _GoneError(f"{self.name} has not ended the verification")
-
-
-class _GoneError(LoopError):
-    """The controller_node has gone during a verification, or does not answer any more."""
+                raise GoneError(f"{self.name} has not ended the verification")
 
 
 def _is_early(reason: str) -> bool:

@@ -30,8 +30,9 @@ from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.nodes.live_types import CommandMessage, reader_of
 from relay_autotune.nodes.tables import GAINS, MESSAGE_PARAMETERS, OWN_LAWS, parameters_of_law
 
-# Names of the gains that may be sent, of the ISA and of the parallel form.
-NAMES = ("kc", "ti", "td", "tf", "b", "p", "i", "d")
+# Names of the gains that may be sent, of the ISA and of the parallel form, and the time constant
+# of a back-calculation, which belongs to them.
+NAMES = ("kc", "ti", "td", "tf", "b", "p", "i", "d", "tracking")
 
 # Longest wait for an answer of another node [s].
 TIMEOUT = 2.0

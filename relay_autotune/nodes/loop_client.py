@@ -48,6 +48,10 @@ _OTHER_ENDS = (
 )
 
 
+class GoneError(LoopError):
+    """A node has gone, or does not answer any more."""
+
+
 class LoopClient:
     """Call the nodes of one loop.
 
@@ -55,7 +59,8 @@ class LoopClient:
     :param namespace: namespace of the loop; empty: the root, or as the ROS arguments say.
     :param node: name of the node that is called most.
     :param ros: arguments for ROS.
-    :param beside: another client, whose own node and executor this one uses; None: it has its own.
+    :param beside: another client, whose executor this one uses, and without a namespace its own
+        node, too; None: it has its own.
     :raises ParameterError: if the name is not valid.
     """
 
@@ -74,6 +79,8 @@ class LoopClient:
             text = str(error).splitlines()[0].rstrip(":")
             raise ParameterError(f"no node can be {namespace}/{node}: {text}") from None
         self._is_guest = beside is not None
+        self.why_lost: Callable[[], str] = beside.why_lost if beside else lambda: ""
+        """Tells why it is no use to wait any longer; empty: it is."""
         if beside is None:
             self._context = Context()
             rclpy.init(
@@ -81,18 +88,25 @@ class LoopClient:
                 args=list(ros),
                 signal_handler_options=SignalHandlerOptions.NO,
             )
-            self._node = Node(own, namespace=namespace or None, context=self._context)
             self._executor = SingleThreadedExecutor(context=self._context)
+        else:
+            self._context, self._executor = beside._context, beside._executor
+        if beside is None or namespace:
+            self._node = Node(own, namespace=namespace or None, context=self._context)
             self._executor.add_node(self._node)
         else:
-            self._context, self._node = beside._context, beside._node
-            self._executor = beside._executor
+            self._node = beside._node
+        # That of the client which has the executor.
+        self._first: Node = beside._first if beside else self._node
         self.name = self._node.resolve_service_name(node)
         self._services: dict[str, Any] = {}
 
     def close(self) -> None:
         """Leave the graph."""
         if self._is_guest:
+            if self._node is not self._first:
+                self._executor.remove_node(self._node)
+                self._node.destroy_node()
             return
         self._executor.shutdown(timeout_sec=0.0)
         self._node.destroy_node()
@@ -169,7 +183,19 @@ class LoopClient:
 
         :param condition: what is waited for.
         :param patience: how long [s].
+        :raises GoneError: if it is no use to wait any longer.
         """
+
+        def is_over() -> bool:
+            if condition():
+                return True
+            if why := self.why_lost():
+                raise GoneError(why)
+            return False
+
+        return self._handle(is_over, patience)
+
+    def _handle(self, condition: Callable[[], bool], patience: float) -> bool:
         deadline = time.monotonic() + patience
         while not condition():
             left = deadline - time.monotonic()
@@ -255,13 +281,6 @@ class LoopClient:
             mouth.wait_for_all_acked(Duration(seconds=_AGAIN))
         finally:
             self._node.destroy_publisher(mouth)
-
-    def has_publisher(self, topic: str) -> bool:
-        """Tell whether a topic has a publisher.
-
-        :param topic: its full name.
-        """
-        return self._node.count_publishers(topic) > 0
 
     def values(
         self, node: str, names: Sequence[str], patience: float = ANSWER_WITHIN

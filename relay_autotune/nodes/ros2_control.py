@@ -24,7 +24,7 @@ from rcl_interfaces.srv import ListParameters
 from std_msgs.msg import String
 
 from relay_autotune.errors import LoopError
-from relay_autotune.nodes.loop_client import LoopClient
+from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
 
 # How long the manager may take for one switch, and until the former controllers are active [s].
 _SWITCH_WITHIN = 5
@@ -92,48 +92,63 @@ class ControllerManager:
 
     :param client: a node of the graph.
     :param name: full name of the manager; empty: the only one that is there.
+    :param within: its namespace; None: any.
     :param patience: how long to wait for it [s].
     :raises LoopError: if it is not there, or its messages are not installed.
     """
 
-    def __init__(self, client: LoopClient, name: str, patience: float) -> None:
+    def __init__(self, client: LoopClient, name: str, within: str | None, patience: float) -> None:
         self.client = client
         """The node of the graph that asks it."""
         self._kinds = {
             kind: interface_class("controller_manager_msgs", "srv", kind)
             for kind in ("ListControllers", "ListHardwareInterfaces", "SwitchController")
         }
-        wanted = f"/{name.strip('/')}" if name else ""
-        there: list[str] = []
-
-        def is_there() -> bool:
-            there[:] = client.owners(_LIST)
-            return wanted in there if wanted else bool(there)
-
-        if not client.wait(is_there, patience):
+        self._wanted = f"/{name.strip('/')}" if name else ""
+        self._within = within
+        if not client.wait(lambda: bool(self._meant()), patience):
+            where = self._wanted or (f"in {within or '/'}" if within is not None else "")
+            there = ", ".join(client.owners(_LIST)) or "none"
             raise LoopError(
-                f"no controller_manager {wanted or ''} within {patience:g} s, of those that "
-                f"list_controllers: {', '.join(there) or 'none'}; type --controller-manager NAME"
+                f"no controller_manager {where} within {patience:g} s, of those that "
+                f"list_controllers: {there}; type --controller-manager NAME"
             )
-        if not wanted and len(there) > 1:
-            raise LoopError(
-                f"several controller_managers are there: {', '.join(there)}; type "
-                f"--controller-manager with one of them"
-            )
-        self.name = wanted or there[0]
+        self.require_alone()
+        (self.name,) = self._meant()
         self.namespace = self.name.rpartition("/")[0]
         """Namespace of the manager and of its controllers."""
 
-    def node_of(self, controller: str) -> str:
-        """Return the full name of a controller's node."""
-        return f"{self.namespace}/{controller}"
+    def _meant(self) -> list[str]:
+        """Return the full names of the managers that may be meant."""
+        return [
+            each
+            for each in self.client.owners(_LIST)
+            if self._wanted in ("", each) and self._within in (None, each.rpartition("/")[0])
+        ]
 
-    def controllers(self) -> tuple[ManagedController, ...]:
+    def require_alone(self) -> None:
+        """Refuse to choose between several managers, the second of which may be found later.
+
+        :raises LoopError: with their names.
+        """
+        if len(meant := self._meant()) > 1:
+            raise LoopError(
+                f"several controller_managers are there: {', '.join(meant)}; type "
+                f"--controller-manager with one of them, or its namespace before the controller, "
+                f"such as --controller {meant[0].rpartition('/')[0]}/NAME"
+            )
+
+    def node_of(self, name: str) -> str:
+        """Return the full name of a node or a topic in the manager's namespace."""
+        return f"{self.namespace}/{name}"
+
+    def controllers(self, patience: float = ANSWER_WITHIN) -> tuple[ManagedController, ...]:
         """Return the controllers that are loaded.
 
+        :param patience: how long to wait for the answer [s].
         :raises LoopError: if the manager does not answer.
         """
-        return _listed(self._ask("ListControllers").controller)
+        return _listed(self._ask("ListControllers", patience=patience).controller)
 
     def command_interfaces(self) -> tuple[str, ...]:
         """Return the names of the command interfaces that the hardware offers.
@@ -143,11 +158,17 @@ class ControllerManager:
         found = self._ask("ListHardwareInterfaces").command_interfaces
         return tuple(each.name for each in found if each.is_available)
 
-    def switch(self, activate: Iterable[str], deactivate: Iterable[str]) -> None:
+    def switch(
+        self,
+        activate: Iterable[str],
+        deactivate: Iterable[str],
+        patience: float = ANSWER_WITHIN,
+    ) -> None:
         """Switch controllers in one step of the manager, all of them or none.
 
         :param activate: their names.
         :param deactivate: likewise.
+        :param patience: how long to wait for the answer [s].
         :raises LoopError: with the manager's reason, if it refuses or does not answer.
         """
         kind = self._kinds["SwitchController"]
@@ -158,7 +179,7 @@ class ControllerManager:
             activate_asap=True,
         )
         request.timeout.sec = _SWITCH_WITHIN
-        answer = self._ask("SwitchController", request)
+        answer = self._ask("SwitchController", request, patience)
         if not answer.ok:
             # Managers of older releases give no reason.
             why = getattr(answer, "message", "") or "its log says why"
@@ -198,10 +219,10 @@ class ControllerManager:
         words += ["--activate", *activate] if activate else []
         return shlex.join([*words, *(["--deactivate", *deactivate] if deactivate else [])])
 
-    def _ask(self, kind: str, request: Any = None) -> Any:
+    def _ask(self, kind: str, request: Any = None, patience: float = ANSWER_WITHIN) -> Any:
         service = "".join(f"_{c.lower()}" if c.isupper() else c for c in kind).lstrip("_")
         asked = request if request is not None else self._kinds[kind].Request()
-        return self.client.call(self._kinds[kind], f"{self.name}/{service}", asked)
+        return self.client.call(self._kinds[kind], f"{self.name}/{service}", asked, patience)
 
 
 def _listed(found: Iterable[Any]) -> tuple[ManagedController, ...]:
@@ -302,10 +323,18 @@ class Opened:
     :param manager: the manager.
     :param forward: name of the forwarding controller.
     :param former: names of those that are switched off.
+    :param then: called when they are active again.
     """
 
-    def __init__(self, manager: ControllerManager, forward: str, former: tuple[str, ...]) -> None:
+    def __init__(
+        self,
+        manager: ControllerManager,
+        forward: str,
+        former: tuple[str, ...],
+        then: Callable[[], None],
+    ) -> None:
         self._manager, self._forward, self._former = manager, forward, former
+        self._then = then
 
     def __enter__(self) -> Opened:
         try:
@@ -335,23 +364,25 @@ class Opened:
         manager = self._manager
         deadline = time.monotonic() + _BACK_WITHIN
         problem = ""
-        while time.monotonic() < deadline:
+        while (left := deadline - time.monotonic()) > 0.0:
             try:
-                states = {each.name: each.state for each in manager.controllers()}
+                states = {each.name: each.state for each in manager.controllers(left)}
                 lacking = [name for name in self._former if states.get(name) != _ACTIVE]
                 extra = [self._forward] if states.get(self._forward) == _ACTIVE else []
                 if not lacking and not extra:
-                    return
+                    break
                 # A strict switch is refused as a whole for one that is in its state already.
-                manager.switch(lacking, extra)
+                manager.switch(lacking, extra, deadline - time.monotonic())
             except LoopError as error:
                 problem = str(error)
                 manager.client.rest(_AGAIN)
-        typed = manager.command_for(self._former, [self._forward])
-        raise LoopError(
-            f"{', '.join(self._former)} could not be activated again"
-            f"{f' ({problem})' if problem else ''}: see to the joint, then type: {typed}"
-        )
+        else:
+            typed = manager.command_for(self._former, [self._forward])
+            raise LoopError(
+                f"{', '.join(self._former)} could not be activated again"
+                f"{f' ({problem})' if problem else ''}: see to the joint, then type: {typed}"
+            )
+        self._then()
 
 
 PID_CONTROLLER = "pid_controller/PidController"
@@ -365,17 +396,9 @@ _LOOK, _LEAST = 0.3, 5
 _DESCRIPTION_WITHIN = 2.0
 # What a trajectory controller commands, by its field in the points of its state.
 _POINTS = {"velocity": "velocities", "effort": "effort"}
-# The laws of control_toolbox, which both controllers run.
-LAWS = {
-    "back_calculation": "control_toolbox_back_calculation",
-    "conditional_integration": "control_toolbox_conditional_integration",
-    "none": "control_toolbox_none",
-    "legacy": "control_toolbox_legacy",
-}
 # What is read of each degree of freedom, with the value that it has where it is not declared.
 _OPTIONAL: dict[str, Any] = {
     "antiwindup_strategy": "legacy",
-    "tracking_time_constant": 0.0,
     "save_i_term": False,
     "feedforward_gain": 0.0,
     "ff_velocity_scale": 0.0,
@@ -441,7 +464,6 @@ class JointLoop(_Parts):
     :param is_simulated: True if the robot runs on /clock.
     :param gains: p, i and d in force.
     :param strategy: against windup.
-    :param tracking_time_constant: of that strategy [s]; 0: control_toolbox's own.
     :param save_i_term: True if the integral outlives a deactivation.
     :param feedforward: gain from the reference to the command [u/y]; 0: none.
     :param wraps: True if the error is wrapped to half a turn.
@@ -462,7 +484,6 @@ class JointLoop(_Parts):
     is_simulated: bool
     gains: tuple[float, float, float]
     strategy: str
-    tracking_time_constant: float
     save_i_term: bool
     feedforward: float
     wraps: bool
@@ -479,10 +500,8 @@ class JointLoop(_Parts):
 
     @property
     def law(self) -> str:
-        """The law that the gains are for."""
-        # The same law, by the name of the program that has a file of parameters.
-        is_own = self.strategy == "back_calculation" and not self.follows
-        return "pid_controller" if is_own else LAWS[self.strategy]
+        """The law of control_toolbox, which all these controllers run, that the gains are for."""
+        return f"control_toolbox_{self.strategy}"
 
     @property
     def why_not_moved(self) -> str:
@@ -512,9 +531,13 @@ class JointLoop(_Parts):
         return f"values[{self.joint}]"
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """The controller's parameters that hold p, i and d."""
-        return tuple(f"gains.{self.dof}.{name}" for name in GAINS)
+    def places(self) -> dict[str, str]:
+        """The controller's parameter for each gain that is set."""
+        names = dict(zip(GAINS, GAINS, strict=True))
+        if self.strategy == "back_calculation":
+            # A pid_controller that runs takes it from new gains only where it is set with them.
+            names["tracking"] = "tracking_time_constant"
+        return {gain: f"gains.{self.dof}.{name}" for gain, name in names.items()}
 
     @property
     def reference_alone(self) -> str:
@@ -587,7 +610,6 @@ def joint_loop(
         is_simulated=client.values(node, ["use_sim_time"])["use_sim_time"],
         gains=(own["p"], own["i"], own["d"]),
         strategy=own["antiwindup_strategy"],
-        tracking_time_constant=own["tracking_time_constant"],
         save_i_term=own["save_i_term"],
         feedforward=own[parts.feeds] if parts.feeds else 0.0,
         wraps=own["angle_wraparound"]
@@ -705,8 +727,8 @@ def put_gains(
 
 
 def told(gains: Mapping[str, float]) -> str:
-    """Return gains in words, by the last letter of their parameters."""
-    return ", ".join(f"{name[-1]} {value:.6g}" for name, value in gains.items())
+    """Return gains in words, by the last part of their parameters."""
+    return ", ".join(f"{n.rpartition('.')[2]} {value:.6g}" for n, value in gains.items())
 
 
 def _of_dof(client: LoopClient, node: str, dof: str) -> dict[str, Any]:
@@ -746,10 +768,10 @@ def _states(client: LoopClient, node: str, parts: _Parts) -> tuple[DofState, ...
 def _description(client: LoopClient, namespace: str) -> str:
     """Return the robot's description; empty: none is published."""
     for topic in dict.fromkeys((f"{namespace}/robot_description", "/robot_description")):
-        if client.has_publisher(topic):
-            found = client.latched(String, topic, lambda m: m.data, _DESCRIPTION_WITHIN)
-            if found is not None:
-                return str(found.data)
+        # Its publisher may be discovered after the manager.
+        found = client.latched(String, topic, lambda m: m.data, _DESCRIPTION_WITHIN)
+        if found is not None:
+            return str(found.data)
     return ""
 
 

@@ -217,7 +217,8 @@ FIXED = (
     ),
     Quantity("apply_parameters", "p:p,i:i,d:d").means(
         "That node's parameter for each gain, separated by commas, such as "
-        "p:gains.heater.p,i:gains.heater.i,d:gains.heater.d."
+        "p:gains.heater.p,i:gains.heater.i,d:gains.heater.d; tracking is the time constant of a "
+        "back-calculation."
     ),
     Quantity("apply_feedforward", 0.0, "u/y").means(
         "With apply_to: gain from the set-point to the command that the node adds to that of its "

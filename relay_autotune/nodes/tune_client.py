@@ -45,11 +45,14 @@ class TuneClient(LoopClient):
     :param namespace: namespace of the loop; empty: the root, or as the ROS arguments say.
     :param node: name of the relay_node.
     :param ros: arguments for ROS.
+    :param beside: another client, whose executor this one uses; None: it has its own.
     :raises ParameterError: if the name is not valid.
     """
 
-    def __init__(self, namespace: str, node: str, ros: Sequence[str] = ()) -> None:
-        super().__init__("tune_loop", namespace, node, ros)
+    def __init__(
+        self, namespace: str, node: str, ros: Sequence[str] = (), beside: LoopClient | None = None
+    ) -> None:
+        super().__init__("tune_loop", namespace, node, ros, beside)
         self._client = ActionClient(self._node, Tune, f"{node}/tune")
         self._alive = True
         self._node.create_subscription(
@@ -65,6 +68,10 @@ class TuneClient(LoopClient):
         self._goal: Any = None
         self._answer: Any = None
         self._seen = time.monotonic()
+        self.left_behind = (
+            "nobody publishes the command, and the last one stays in force; see to the plant"
+        )
+        """What follows where relay_node is lost during a tune."""
         self.refused: set[str] = set()
         """Sentences on results that were received and refused."""
 
@@ -137,7 +144,8 @@ class TuneClient(LoopClient):
         :param seconds: the time [s].
         :raises LoopError: if the node is lost.
         """
-        self.wait(self._answer.done, seconds)
+        # A node that is lost during a tune is told with what that means for the plant.
+        self._handle(self._answer.done, seconds)
         if self._answer.done() or (self._alive and self._client.server_is_ready()):
             self._seen = time.monotonic()
         elif time.monotonic() - self._seen <= _GONE:
@@ -148,10 +156,8 @@ class TuneClient(LoopClient):
                 f"and the recording say how the tune ended"
             )
         else:
-            raise LoopError(
-                f"{self.name} has gone during the tune, or cannot be heard any more: nobody "
-                f"publishes the command, and the last one stays in force; see to the plant"
-            )
+            why = self.why_lost() or f"{self.name} has gone, or cannot be heard any more"
+            raise LoopError(f"during the tune {why}: {self.left_behind}")
 
     def _on_liveliness(self, info: Any) -> None:
         self._alive = info.alive_count > 0
@@ -190,7 +196,7 @@ class TuneClient(LoopClient):
         refused = not self.succeeded and not self.result.experiment.experiment_id
         said = (self.result.reason, *self.result.checks)
         # A publisher of this node, which has held a joint, is known for a while after its end.
-        mine = f"is also published by {self._node.get_fully_qualified_name()}:"
+        mine = f"is also published by {self._first.get_fully_qualified_name()}:"
         return refused and any(reason in text for text in said for reason in (*_NOT_YET, mine))
 
     @property

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from relay_autotune.cli import replay, terminal, tune
 from relay_autotune.errors import ParameterError, SelectionError
-from relay_autotune.exchange.export import Target, exported, number, pid_controller, plain
+from relay_autotune.exchange.export import Target, exported, number, parameters, plain
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import DesignOptions, Gains, Performance
@@ -37,6 +37,10 @@ PERFORMANCE = Performance(
 def gains(*values: float, **more: float) -> Gains:
     reason = 'so "fast": it is'
     return Gains(*values, **vars(PERFORMANCE), **more, rule="imc", ms_95=1.41, reason=reason)
+
+
+def pid_controller(made: Gains, target: Target) -> str:
+    return parameters(made, LAWS["pid_controller"], target)
 
 
 def as_loaded(text: str, prefix: str = "") -> dict[str, object]:
@@ -109,7 +113,23 @@ def test_what_pid_controller_lacks_is_said_in_the_file():
     assert as_loaded(text)["gains.joint.tracking_time_constant"] == pytest.approx(2.0)
 
 
-@pytest.mark.parametrize("name", ["yes", "on", "null", "Off"])
+@pytest.mark.parametrize("law", [name for name, law in LAWS.items() if law.sets_gains])
+def test_gains_of_a_controller_that_runs_can_be_loaded_whatever_its_strategy(law: str) -> None:
+    made = gains(2.0, 4.0, law=law, law_period=0.01)
+    target = Target("/robot1/arm", "odd/name", is_set_up=True)
+    text = exported(made, law, target)
+    assert list(yaml.safe_load(text)) == ["/robot1/arm"]
+    found = {"p": 2.0, "i": 0.5, "d": 0.0}
+    if law in ("pid_controller", "control_toolbox_back_calculation"):
+        found["tracking_time_constant"] = 4.0
+    assert as_loaded(text) == {f"gains.odd/name.{n}": v for n, v in found.items()}
+    # Its rate is known, and it has no such flag.
+    assert "--sample-period" not in text
+    strategy = as_loaded(exported(made, law, Target()))["gains.joint.antiwindup_strategy"]
+    assert law in ("pid_controller", f"control_toolbox_{strategy}")
+
+
+@pytest.mark.parametrize("name", ["yes", "on", "null", "Off", "2nd", "1.5", "-", "a-b", "a/b"])
 def test_a_name_that_yaml_has_other_plans_for(name):
     assert f"gains.{name}.p" in as_loaded(pid_controller(gains(1.0, 1.0), Target(dof=name)))
 
@@ -119,7 +139,7 @@ def test_a_name_that_yaml_has_other_plans_for(name):
     [
         {"node": "pid controller"},
         {"node": "/a//b"},
-        {"dof": "2nd"},
+        {"dof": "2nd/"},
         {"dof": "a: b"},
         {"command_min": 3.0, "command_max": 3.0},
         {"command_min": math.nan},
@@ -181,7 +201,7 @@ def settings_of(text: str) -> dict[str, str]:
     return {name: value for name, value in found if not name.startswith("_")}
 
 
-@pytest.mark.parametrize("name", [n for n in LAWS if n != "pid_controller"])
+@pytest.mark.parametrize("name", [n for n, law in LAWS.items() if not law.sets_gains])
 def test_a_law_gets_its_settings_in_the_words_of_its_program(name, capsys):
     assert tune.main([*OVEN, "--pid", "--rule", "imc", "--export", name]) == 0
     text = capsys.readouterr().out

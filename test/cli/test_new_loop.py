@@ -16,16 +16,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
 import yaml
 from made_experiments import record_of
 
 from relay_autotune.cli import report, tune_loop
 from relay_autotune.cli.after_tune import AfterTune, prefix
 from relay_autotune.cli.own_nodes import (
+    OwnNodes,
     add_new_loop,
     is_new_loop,
     is_of_joint,
+    namespace_of_joint,
     nodes_for,
+    ros_arguments,
     with_flags,
 )
 from relay_autotune.cli.terminal import agrees, asked_for_file, number_of, pair_of
@@ -33,6 +37,7 @@ from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
 from relay_autotune.exchange.messages import fill_gains
 from relay_autotune.nodes.live_types import FLOAT64
+from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import TransferFunction
@@ -40,6 +45,54 @@ from relay_autotune.tuning import DesignOptions, DesignTask, design
 from relay_autotune.verdict import Verdict
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains
+
+
+def test_the_last_line_of_a_node_that_died_ends_every_wait_for_it() -> None:
+    with OwnNodes() as nodes:
+        # It finds nothing to run.
+        nodes.start("missing_node", [])
+        client: Any = LoopClient.__new__(LoopClient)
+        client._executor = SimpleNamespace(spin_once=lambda timeout_sec: None)
+        client.why_lost = nodes.why_lost
+        with pytest.raises(LoopError, match="missing_node has ended: ImportError: cannot import"):
+            client.wait(lambda: False, 60.0)
+        assert client.wait(lambda: True, 0.0)
+
+
+def test_no_two_joints_share_the_namespace_of_their_nodes() -> None:
+    joints = (
+        "odd/name",
+        "odd_name",
+        "odd__name",
+        "odd_x2fzname",
+        "odd-",
+        "/x",
+        "_",
+        "__",
+        "ö",
+        "",
+    )
+    controllers = ("/wheel_pid", "/robot1/wheel_pid", "/robot2/wheel_pid")
+    found = [namespace_of_joint(each, joint) for each in controllers for joint in joints]
+    assert len(set(found)) == len(found)
+    # As ROS takes them on the command line.
+    for each in found[: len(joints)]:
+        context = rclpy.Context()
+        rclpy.init(args=["--ros-args", *ros_arguments(each)], context=context)
+        context.try_shutdown()
+    assert namespace_of_joint("/wheel_pid", "left_wheel") == "/wheel_pid/tune_left_wheel"
+
+
+def test_a_file_that_exists_is_noticed_before_anything_is_looked_at(tmp_path, capsys) -> None:
+    given = ["--controller", "pid", "--joint", "wheel", "--yes", "--export"]
+    (tmp_path / "gains.yaml").write_text("mine")
+    for name, told in (
+        ("gains.yaml", "exists already"),
+        ("none/gains.yaml", "no writable"),
+    ):
+        assert tune_loop.main([*given, str(tmp_path / name)]) == 2
+        assert told in capsys.readouterr().err
+    assert (tmp_path / "gains.yaml").read_text() == "mine"
 
 
 class Looker:
@@ -282,7 +335,7 @@ def shown(
     given = parser.parse_args(["--measurement", "/tank/level", "--command", "/tank/valve"])
     given.at, given.within, given.command_within = 35.0, [0.0, 90.0], [0.0, 100.0]
     words = ["-r", "__ns:=/tune_loop_1", "-r", "command:=/tank/valve", "-p", "baseline:=35.0"]
-    nodes: Any = SimpleNamespace(require_alive=lambda: None, arguments=lambda name: words)
+    nodes: Any = SimpleNamespace(why_lost=lambda: "", arguments=lambda name: words)
     monkeypatch.chdir(tmp_path)
 
     def analysed(_: Any, values: dict[str, Any], __: Any) -> Any:
@@ -404,6 +457,6 @@ def test_a_publisher_of_its_own_that_has_ended_is_no_reason_to_give_up(other, pa
     reason = f"/u is also published by {other}: two of them would fight for the actuator"
     client: Any = SimpleNamespace(
         succeeded=False, result=Tune.Result(reason=reason),
-        _node=SimpleNamespace(get_fully_qualified_name=lambda: "/t/tune_loop"),
+        _first=SimpleNamespace(get_fully_qualified_name=lambda: "/t/tune_loop"),
     )  # fmt: skip
     assert TuneClient.not_ready_yet.fget(client) is passes

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 import shlex
+from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,12 +20,14 @@ from relay_autotune.cli.joint_tune import JointTune
 from relay_autotune.errors import LoopError
 from relay_autotune.loop import laws
 from relay_autotune.loop.gains import Controller
-from relay_autotune.nodes.gains_place import controller_of
+from relay_autotune.nodes import ros2_control
+from relay_autotune.nodes.gains_place import controller_of, mapping_of
 from relay_autotune.nodes.ros2_control import (
-    LAWS,
     TRAJECTORY_CONTROLLER,
+    ControllerManager,
     DofState,
     ManagedController,
+    Opened,
     above,
     forwarding,
     in_the_way,
@@ -32,7 +36,9 @@ from relay_autotune.nodes.ros2_control import (
     limits_in,
     put_gains,
 )
+from relay_autotune_msgs.action import Tune
 
+STRATEGIES = ("back_calculation", "conditional_integration", "none", "legacy")
 DESCRIPTION = """<?xml version="1.0"?>
 <robot name="arm">
   <joint name="arm_1" type="revolute">
@@ -116,10 +122,10 @@ def test_joints_that_would_go_limp_have_to_be_written_too() -> None:
         forwarding(LOADED, "left/effort", "", ("left/effort", "arm/effort", "leg/effort"))
 
 
-@pytest.mark.parametrize("strategy", LAWS)
+@pytest.mark.parametrize("strategy", STRATEGIES)
 def test_gains_are_designed_for_the_law_of_the_strategy(strategy: str) -> None:
     period, gains = 0.01, Controller(0.8, 0.4, 0.05)
-    running = laws.LAWS[LAWS[strategy]].at(gains, period).running()
+    running = laws.LAWS[f"control_toolbox_{strategy}"].at(gains, period).running()
     law = ToolboxPid(gains.p, gains.i, gains.d, strategy)
     measured = np.random.default_rng(3).normal(size=200)
     ours = [running.step(1.0, y) for y in measured]
@@ -128,7 +134,7 @@ def test_gains_are_designed_for_the_law_of_the_strategy(strategy: str) -> None:
 
 def test_the_strategies_differ_at_a_limit_of_the_command() -> None:
     left = {}
-    for strategy in LAWS:
+    for strategy in STRATEGIES:
         law = ToolboxPid(1.0, 2.0, 0.0, strategy, u_clamp_min=-1.0, u_clamp_max=1.0)
         for _ in range(100):
             law.step(2.0, 0.01)
@@ -189,6 +195,124 @@ def test_gains_are_set_all_or_none_and_those_before_come_back(answers, told) -> 
     assert client.has == (wanted if "refuses: set" in told else before)
 
 
+@pytest.mark.parametrize(
+    ("name", "within", "there", "found"),
+    [
+        ("", None, ["/controller_manager"], "/controller_manager"),
+        ("", "/b", ["/a/cm", "/b/cm"], "/b/cm"),
+        ("", "", ["/cm", "/b/cm"], "/cm"),
+        ("a/cm", None, ["/a/cm", "/b/cm"], "/a/cm"),
+        ("a/cm", "/b", ["/a/cm", "/b/cm"], "no controller_manager /a/cm within 0 s"),
+        ("", "/c", ["/a/cm", "/b/cm"], "no controller_manager in /c within 0 s"),
+        ("", None, ["/a/cm", "/b/cm"], "/a/cm, /b/cm; type .* such as --controller /a/NAME"),
+    ],
+)
+def test_the_manager_is_the_only_one_that_may_be_meant(name, within, there, found) -> None:
+    client = SimpleNamespace(owners=lambda _: there, wait=lambda condition, _: condition())
+    if not found.startswith("/") or ";" in found:
+        with pytest.raises(LoopError, match=found):
+            ControllerManager(client, name, within, 0.0)
+        return
+    manager = ControllerManager(client, name, within, 0.0)
+    assert (manager.name, manager.namespace) == (found, found.rpartition("/")[0])
+    # A second robot may be discovered after the first.
+    there.append("/late/cm")
+    with pytest.raises(LoopError, match="late") if not name and within is None else nullcontext():
+        manager.require_alone()
+
+
+class Switching:
+    """Stands for the manager of a base, which switches as it is told."""
+
+    def __init__(self) -> None:
+        self.active = {"pid"}
+
+    def controllers(self, patience=0.0):
+        return tuple(
+            replace(c, state="active" if c.name in self.active else "off") for c in LOADED
+        )
+
+    def switch(self, on, off, patience=0.0):
+        self.active = self.active - set(off) | set(on)
+
+    def command_for(self, activate, deactivate):
+        return f"type {' '.join(activate)}"
+
+    def still_active(self, name):
+        return lambda: "" if name in self.active else f"{name} is off"
+
+
+@pytest.mark.parametrize("is_open", [True, False])
+def test_controllers_are_off_until_the_relay_ends_and_no_longer(is_open: bool) -> None:
+    manager, given = Switching(), []
+    publishing = nullcontext(lambda: given.append("command"))
+    tune = SimpleNamespace(
+        _loop=SimpleNamespace(controller="pid"), _manager=manager, _former=("pid",),
+        _forward=next(c for c in LOADED if c.name == "one") if is_open else None,
+        _first_command=lambda: ("rest", "/one/commands"),
+        _client=SimpleNamespace(publishing=lambda *_: publishing),
+        _give_references_back=lambda: given.append("references"),
+        _put_back=lambda: given.append("references"),
+    )  # fmt: skip
+    with JointTune.opened(tune) as why_over:
+        assert why_over(Tune.Feedback.STATE_RELAY) == ""
+        assert manager.active == ({"one"} if is_open else {"pid"})
+        # The model is still to be computed.
+        assert why_over(Tune.Feedback.STATE_COMPLETED) == ""
+        assert manager.active == {"pid"}
+        assert why_over(Tune.Feedback.STATE_COMPLETED) == ""
+    assert given == ["command", "references"] * is_open
+    # relay_node is lost, and the reference is where the relay had it.
+    given.clear()
+    with pytest.raises(LoopError), JointTune.opened(tune):
+        raise LoopError("relay_node has ended")
+    assert given == (["command", "references"] if is_open else ["references"])
+    assert manager.active == {"pid"}
+
+
+def test_a_joint_whose_controller_is_off_is_told_with_what_to_type() -> None:
+    class Silent(Switching):
+        def controllers(self, patience=0.0):
+            raise LoopError("it has not answered")
+
+    manager, silent = Switching(), Silent()
+    tune = SimpleNamespace(
+        _loop=SimpleNamespace(
+            joint="left", controller="pid", commanded="effort", why_not_moved=""
+        ),
+        _manager=manager,
+    )
+    tune.activation = lambda: JointTune.activation(tune)
+    assert JointTune.left(tune) == "pid is active, the reference of left is that of before"
+    assert tune.activation() == ""
+    manager.switch([], ["pid"])
+    assert JointTune.left(tune) == "pid is not active: left has the last effort that it got"
+    assert tune.activation() == "type pid"
+    tune._manager = silent
+    assert JointTune.left(tune).startswith("it has not answered: left has the last effort")
+
+
+def test_a_manager_that_is_gone_is_not_waited_for_beyond_the_time_of_the_way_back() -> None:
+    asked = []
+
+    class Gone(Switching):
+        client = SimpleNamespace(rest=lambda _: None)
+
+        def controllers(self, patience=0.0):
+            asked.append(patience)
+            # As if all of it had passed.
+            now[0] += patience
+            raise LoopError("no answer")
+
+    now = [0.0]
+    opened = Opened(Gone(), "one", ("pid",), lambda: asked.append("references"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ros2_control, "time", SimpleNamespace(monotonic=lambda: now[0]))
+        with pytest.raises(LoopError, match=r"pid could not be .* \(no answer\).* type: type pid"):
+            opened.close()
+    assert sum(asked) <= ros2_control._BACK_WITHIN
+
+
 class Arm:
     """Stands for the client and the manager of an arm under a trajectory controller."""
 
@@ -232,10 +356,8 @@ class Arm:
         )
         return [message] * least
 
-    def has_publisher(self, topic):
-        return topic == "/robot_description"
-
     def latched(self, kind, topic, wanted, patience):
+        assert topic == "/robot_description" and patience > 0.0
         return SimpleNamespace(data=DESCRIPTION.replace("free", "arm_2"))
 
 
@@ -249,12 +371,26 @@ def test_a_trajectory_controller_tells_joints_gains_state_and_law() -> None:
     loop = joint_loop(arm, arm, "arm", "arm_2")
     assert loop.joints == loop.dofs == ("arm_1", "arm_2")
     assert (loop.interface, loop.measured, loop.period) == ("arm_2/effort", "position", 0.01)
-    assert loop.parameters == ("gains.arm_2.p", "gains.arm_2.i", "gains.arm_2.d")
+    assert loop.places == {name: f"gains.arm_2.{name}" for name in "pid"}
     assert (loop.gains, loop.feedforward) == ((5.0, 1.0, 0.5), 0.7)
     assert (loop.law, loop.has_rate, loop.wraps) == ("control_toolbox_none", True, True)
     # By the names of the message, whatever their order.
     assert loop.state == DofState(0.2, pytest.approx(0.25), pytest.approx(3.0))
     assert loop.why_not_moved == "its references are trajectories"
+
+
+def test_with_back_calculation_its_time_goes_with_the_gains() -> None:
+    # A pid_controller that runs would keep the one that it computed from the gains before.
+    arm = Arm(**{"gains.arm_2.antiwindup_strategy": "back_calculation"})
+    places = joint_loop(arm, arm, "arm", "arm_2").places
+    assert places["tracking"] == "gains.arm_2.tracking_time_constant"
+    gains = Controller(2.0, 0.9, 0.4)
+    given = {name: getattr(gains, name) for name in places}
+    assert set(mapping_of(",".join(map(":".join, places.items())))) == set(given)
+    law = ToolboxPid(gains.p, gains.i, gains.d, "back_calculation")
+    assert given["tracking"] == pytest.approx(law.tracking())
+    assert Controller(2.0, 0.9).tracking == 0.9
+    assert Controller(2.0, 0.0, 0.4).tracking == 0.0
 
 
 def test_the_trajectory_to_type_holds_numbers_also_where_a_joint_is_almost_at_zero() -> None:

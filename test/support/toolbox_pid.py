@@ -43,7 +43,7 @@ class ToolboxPid:
         wanted = self.p * error + self.integral + self.d * rate
         command = min(max(wanted, self.u_clamp_min), self.u_clamp_max)
         if self.antiwindup_strategy == "back_calculation" and self.i:
-            self.integral += added + period * (command - wanted) / self._tracking()
+            self.integral += added + period * (command - wanted) / self.tracking()
         elif self.antiwindup_strategy == "conditional_integration":
             if command == wanted or error * wanted <= 0.0:
                 self.integral += added
@@ -55,7 +55,7 @@ class ToolboxPid:
     def _clamped(self, integral: float) -> float:
         return min(max(integral, self.i_clamp_min), self.i_clamp_max)
 
-    def _tracking(self) -> float:
+    def tracking(self) -> float:
         if self.tracking_time_constant:
             return self.tracking_time_constant
         return math.sqrt(self.d / self.i) if self.d else self.p / self.i
