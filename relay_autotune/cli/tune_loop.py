@@ -165,6 +165,7 @@ def _tune(options: argparse.Namespace, ros: list[str], graph: ExitStack) -> int:
         check_web(options)
     of_joint = is_of_joint(options)
     new = of_joint or is_new_loop(options)
+
     def joined(kind: Callable[..., _Client], *arguments: Any) -> _Client:
         try:
             with Working("joining the ROS graph"):
