@@ -265,7 +265,7 @@ REFUSED = [
     (FOPDT + " --phase-peak -30", 2, "between -180 and -90"),
     (FOPDT + " --output there", 2, "--output is for --export"),
     (FOPDT + " --table --export yaml", 2, "leave out --table"),
-    (FOPDT + " --export pid_controller --dof 2nd", 2, "'2nd' is not a name"),
+    (FOPDT + " --export pid_controller --dof 2nd/", 2, "'2nd/' is not a name"),
     (FOPDT + " there.json", 2, "given twice"),
     ("there.json", 2, "there.json cannot be read: No such file"),
     (FOPDT + " --rule lcmax", 1, "3 or more equal lags, found fopdt"),
