@@ -15,9 +15,9 @@ import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 from relay_autotune.cli.terminal import broken, width
 from relay_autotune.errors import MissingPackageError, RelayAutotuneError, SelectionError, defect
@@ -130,6 +130,23 @@ def guarded(program: str, work: Callable[[], int]) -> int:
     return status
 
 
+_Client = TypeVar("_Client")
+
+
+class Graph(ExitStack):
+    """The clients of a command in the ROS graph.
+
+    :ivar joined: True: it has, or had, at least one.
+    """
+
+    joined = False
+
+    def enter_context(self, cm: AbstractContextManager[_Client]) -> _Client:
+        """Enter a client, which is left at the end."""
+        self.joined = True
+        return super().enter_context(cm)
+
+
 def guarded_in_graph(program: str, work: Callable[[ExitStack], int]) -> int:
     """Return the exit status of a command that talks to nodes, as `guarded`; leave the graph.
 
@@ -137,12 +154,13 @@ def guarded_in_graph(program: str, work: Callable[[ExitStack], int]) -> int:
     :param work: does it, and returns its exit status; the clients that it enters into the stack
         end afterwards.
     """
-    with ExitStack() as graph:
+    with Graph() as graph:
         status = guarded(program, lambda: work(graph))
-        # Imported here, because other commands do not need ROS.
-        from relay_autotune.nodes.lifetime import LEAVE_WITHIN, end_within
+        if graph.joined:
+            # Imported here, because other commands do not need ROS.
+            from relay_autotune.nodes.lifetime import LEAVE_WITHIN, end_within
 
-        end_within(LEAVE_WITHIN, status)
+            end_within(LEAVE_WITHIN, status)
     return status
 
 
