@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_experiments import record_of
 from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.residuals import covariance_meat, ljung_box
-from relay_autotune.identification.waveform.selection import Ground, of_shown_direction
+from relay_autotune.identification.waveform.selection import Ground, _followed, of_shown_direction
 from relay_autotune.identification.waveform.separable import problem_of
 from relay_autotune.identification.waveform.starts import latest_dead_time
 from relay_autotune.process.response import response
@@ -371,3 +372,12 @@ def test_a_fopdt_that_explains_nearly_all_settles_the_direction(noise, settled):
     (other,) = ground.fit(["sopdt"])
     turned = replace(other, model=replace(plain.model, gain=-2.0))
     assert of_shown_direction([turned, plain]) == ([plain] if settled else [turned, plain])
+
+
+def test_a_structure_of_which_no_fit_can_begin_is_left_out():
+    """As where commands of 1e-9 u came within 1e-300 s, by a record from the network."""
+    record = record_of(TransferFunction.fopdt(2.0, 0.8, 0.4), "", cycles=3)
+    told = record.time, record.measurement, record.input()
+    # One of those that are fitted whatever others promise.
+    problem = problem_of([told], TABLE["fopdt"])
+    assert _followed(problem, [], math.inf) is None
