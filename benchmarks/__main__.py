@@ -44,7 +44,7 @@ GROUPS = {
     "papers": ("chang_studies", "thyagarajan_studies", "paper_designs"),
     "faults": (
         *("fault_table", "controller_kills", "random_histories", "simulated_experiments"),
-        *("fuzz_bags", "fuzz_coverage", "fuzz_framing"),
+        *("fuzz_bags", "fuzz_coverage", "fuzz_framing", "fuzz_requests"),
     ),
     "recordings": ("real_recordings", "verdicts"),
 }

@@ -12,15 +12,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_experiments import record_of
 from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.waveform.candidates import _followed
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.residuals import ljung_box
+from relay_autotune.identification.waveform.separable import problem_of
 from relay_autotune.identification.waveform.starts import latest_dead_time
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import RelayRun, simulate_relay
+from relay_autotune.process.structures import TABLE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
@@ -350,3 +354,12 @@ def test_a_dead_time_that_hides_the_first_response_is_no_explanation():
     found = identify_waveform(Record(time, response(process, time, felt) + noise, command))
     assert found.model.dead_time < 20.0
     assert 20.0 < sum(abs(t) for t in found.model.time_constants) < 80.0
+
+
+def test_a_structure_of_which_no_fit_can_begin_is_left_out():
+    """As where commands of 1e-9 u came within 1e-300 s, by a record from the network."""
+    record = record_of(TransferFunction.fopdt(2.0, 0.8, 0.4), "", cycles=3)
+    told = record.time, record.measurement, record.input()
+    # One of those that are fitted whatever others promise.
+    problem = problem_of([told], TABLE["fopdt"])
+    assert _followed(problem, [], math.inf) is None

@@ -506,6 +506,9 @@ def _followed(problem: Problem, begun: list[Trial], least: float) -> Trial | Non
     if not asked and promises_nothing(begun):
         return None
     rough = go_on(problem, begun)
+    if not rough:
+        # No response of any of them can be told, as of a command that is far too small.
+        return None
     if not asked and is_hopeless(rough[0]):
         if promises_nothing(rough[:1]):
             return None
