@@ -15,6 +15,7 @@ The spline is fitted by least squares and may have a kink.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -381,6 +382,35 @@ def fold_without(
     """
     rest = tuple(c for c in cycles if c != left_out)
     return _average(record, rest, fold(record, cycles, sharp=sharp), sharp=False)
+
+
+# Of many cycles, not every one is left out.
+_LEAST_CYCLES, _MOST_PARTS = 3, 20
+
+
+def scatter_of_fold(
+    record: Record,
+    cycles: tuple[int, ...],
+    measure: Callable[[Fold], FloatArray],
+    *,
+    sharp: bool = False,
+) -> FloatArray | None:
+    """Return the covariance of what is measured on an average, by leaving out each cycle once.
+
+    :param record: with whole cycles.
+    :param cycles: numbers of the cycles that are averaged.
+    :param measure: from an averaged period to numbers, shape (n,).
+    :param sharp: as for :func:`fold`.
+    :return: shape (n, n); None for fewer than three cycles.
+    :raises IdentificationError: if there are too few samples without one of them.
+    """
+    count = len(cycles)
+    if count < _LEAST_CYCLES:
+        return None
+    left_out = cycles[:: -(-count // _MOST_PARTS)]
+    parts = np.array([measure(fold_without(record, cycles, c, sharp)) for c in left_out])
+    away = parts - np.mean(parts, axis=0)
+    return np.asarray(away.T @ away * (count - 1) / len(parts))
 
 
 @asked_once

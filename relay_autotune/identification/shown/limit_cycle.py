@@ -210,6 +210,17 @@ class SymmetricCycle:
         """Share of a half period that is left after the dead time, m of Chang et al."""
         return 1.0 - 2.0 * self.dead_time / self.period
 
+    def require_switching(self) -> None:
+        """Refuse a limit cycle within the switching level.
+
+        :raises IdentificationError: if the level is not below the amplitude.
+        """
+        if not abs(self.level) < self.amplitude:
+            raise IdentificationError(
+                f"an amplitude of {self.amplitude:g} is not above the hysteresis of "
+                f"{self.level:g}, so that the relay cannot have switched: check the numbers"
+            )
+
 
 def require_unbiased(method: str, settings: RelaySettings) -> None:
     """Refuse a biased relay.
@@ -220,20 +231,6 @@ def require_unbiased(method: str, settings: RelaySettings) -> None:
         raise IdentificationError(
             f"the relay had a bias of {settings.bias:g}, but the equations of {method} hold for "
             "a symmetric one: use the method wang_biased or waveform"
-        )
-
-
-def require_switching(amplitude: float, hysteresis: float) -> None:
-    """Refuse a limit cycle within the hysteresis.
-
-    :param amplitude: a [y].
-    :param hysteresis: epsilon [y].
-    :raises IdentificationError: if the hysteresis is not below the amplitude.
-    """
-    if not hysteresis < amplitude:
-        raise IdentificationError(
-            f"an amplitude of {amplitude:g} is not above the hysteresis of {hysteresis:g}, so "
-            "that the relay cannot have switched: check the numbers"
         )
 
 
