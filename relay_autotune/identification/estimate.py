@@ -73,14 +73,19 @@ def exact_steps(
     return (at + size) - at, at - np.maximum(at - size, least)
 
 
+# Steps in standard deviations: the first at which there is a value.
+_SHARES = (1.0, 0.1, 0.01, 1e-3)
+
+
 def carried(
     function: Callable[[FloatArray], FloatArray], at: FloatArray, covariance: FloatArray
 ) -> FloatArray:
     """Return the covariance of a function of uncertain numbers, by one step along each axis.
 
     The steps are one standard deviation along the principal axes of the covariance, to both sides
-    where the function has a value there. For the solution x of equations f(x, z) = 0 in the
-    numbers z this is the implicit function theorem, dx = -(df/dx)^-1 (df/dz) dz.
+    where the function has a value there, and less where it has one on none. For the solution x of
+    equations f(x, z) = 0 in the numbers z this is the implicit function theorem,
+    dx = -(df/dx)^-1 (df/dz) dz.
 
     :param function: from numbers, shape (n,), to values, shape (p,); where it raises an
         ``IdentificationError`` it has none.
@@ -97,17 +102,22 @@ def carried(
     size, axes = np.linalg.eigh(covariance[np.ix_(used, used)] / np.outer(alone, alone))
     steps = np.zeros((size.size, at.size))
     steps[:, used] = (axes * np.sqrt(np.maximum(size, 0.0))).T * alone
-    columns = []
-    for step in steps:
-        ends = []
-        for side in (step, -step):
-            try:
-                ends.append(function(at + side))
-            except IdentificationError:
-                continue
-        lone = ends[0] - here if len(ends) == 1 else np.full(here.size, math.nan)
-        columns.append(0.5 * (ends[0] - ends[1]) if len(ends) == 2 else lone)
-    root = np.array(columns).reshape(-1, here.size)
+
+    def change(step: FloatArray) -> FloatArray:
+        for share in _SHARES:
+            ends = []
+            for side in (share, -share):
+                try:
+                    ends.append(function(at + side * step))
+                except IdentificationError:
+                    continue
+            if len(ends) == 2:
+                return (ends[0] - ends[1]) / (2.0 * share)
+            if ends:
+                return (ends[0] - here) / share
+        return np.full(here.size, math.nan)
+
+    root = np.array([change(step) for step in steps]).reshape(-1, here.size)
     return np.asarray(root.T @ root)
 
 

@@ -21,8 +21,8 @@ _NO_VALUE = 1e12
 # longest lag is an integrator.
 _LARGEST, _SMALLEST = 300.0, 1e-300
 _LONGEST = 1e4
-_STARTS = 3
-_MOST_STEPS = 60
+_STARTS = 4
+_MOST_STEPS = 200
 _EXACT = 1e-20
 # Step of derivatives, and distance that counts as at an end: in logarithms, or in units of time.
 _DIFFERENCE = 1e-4

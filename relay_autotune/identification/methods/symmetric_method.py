@@ -166,7 +166,8 @@ class LimitCycle:
             self.cycle,
             period=period,
             amplitude=amplitude,
-            switch_level=min(max(height, 0.0), 0.99 * amplitude),
+            # The scatter about zero is that of the reading, to both sides.
+            switch_level=min(height, 0.99 * amplitude),
             dead_time=max(dead_time, 0.0),
         )
 
@@ -204,7 +205,8 @@ def read_limit_cycle(method: SymmetricMethod, record: Record, known: Known) -> L
 
     def features(stretch: CycleRun) -> FloatArray:
         found = read(stretch)
-        return np.array((found.period, found.amplitude, found.level, 0.0))
+        height = reader.level(stretch) if method.wave is EXACT else found.level
+        return np.array((found.period, found.amplitude, height, 0.0))
 
     covariance, quantile = test.scatter(features)
     if covariance is not None:

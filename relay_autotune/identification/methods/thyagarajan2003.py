@@ -23,6 +23,7 @@ import math
 from scipy.optimize import brentq
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.methods.first_order import first_order
 
 SMALL_DEAD_TIME = 0.001
 HIGHER_ORDER = 5
@@ -55,7 +56,8 @@ def fopdt(
             f"{_earliest(period, amplitude, level):g} s: no stable FOPDT process does that (eq "
             "10); the process has more lags, integrates, or is unstable"
         )
-    return amplitude / (v * relay), 0.25 * period / math.atanh(v), time_to_peak
+    gain, tau, _ = first_order(math.atanh(v), period, amplitude, relay, level)
+    return gain, tau, time_to_peak
 
 
 def unstable_fopdt(
@@ -82,7 +84,8 @@ def unstable_fopdt(
             f"= {_earliest(period, amplitude, level):g} s: no unstable FOPDT process does that "
             "(eq 16)"
         )
-    return -amplitude / (v * relay), -0.25 * period / math.atanh(v), time_to_peak
+    gain, tau, _ = first_order(math.atanh(v), period, amplitude, relay, level)
+    return -gain, -tau, time_to_peak
 
 
 def _earliest(period: float, amplitude: float, level: float) -> float:
@@ -171,11 +174,7 @@ def flat_fopdt(
         w, ultimate_gain = 2.0 * math.pi / period, 4.0 * relay / (math.pi * amplitude)
         dead_time = (math.pi - math.atan(tau * w)) / w
         return math.hypot(1.0, tau * w) / ultimate_gain, tau, dead_time
-    # K h - a and K h - epsilon without the difference of nearly equal numbers.
-    quarter = 0.25 * period / tau
-    g = amplitude / math.tanh(quarter)
-    left = amplitude * 2.0 / math.expm1(2.0 * quarter)
-    return g / relay, tau, tau * math.log((g - level) / left)
+    return first_order(0.25 * period / tau, period, amplitude, relay, level)
 
 
 def dead_time_ratio(growth: float) -> float:

@@ -127,9 +127,10 @@ def identify_thyagarajan(record: Record, known: Known = NOTHING) -> Identificati
         # One lag has sharp peaks, though noise may hide them.
         reading = read_shape(record, sharp=True)
     extra = settings.extra_delay
+    shape = reading.shape
     row, reading, why = choose(reading, replace(known, dead_time=known.dead_time + extra))
     warnings = [why, "" if test.whole.cycle.converged else NOT_SETTLED, skew_warning(test.whole)]
-    warnings = [w for w in warnings if w] + refinements(reading.shape, record)
+    warnings = [w for w in warnings if w] + refinements(shape, record)
     sign = -1.0 if settings.reverse_acting else 1.0
     return _identified(row, reading, settings.amplitude * sign, extra, warnings)
 

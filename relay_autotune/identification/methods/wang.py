@@ -26,8 +26,9 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate, carried
 from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.methods.first_order import first_order
 from relay_autotune.identification.result import Identification, identified
-from relay_autotune.identification.shown.fold import Fold, as_switched, fold, scatter_of_fold
+from relay_autotune.identification.shown.fold import Fold, fold, level_at_switch, scatter_of_fold
 from relay_autotune.identification.shown.fourier import (
     UNKNOWN_REST,
     StaticGain,
@@ -93,6 +94,8 @@ def fopdt_from_biased(
 
 # A/(mu A_0), the limit of eq 25 for T -> infinity: the triangle of an integrator.
 INTEGRATOR_RATIO = 0.5 * math.pi
+# Ends of P/(4 T).
+_SMALLEST_Q, _LARGEST_Q = 2.5e-5, 300.0
 
 
 def fopdt_from_unbiased(
@@ -108,29 +111,21 @@ def fopdt_from_unbiased(
     :raises IdentificationError: if eq 25 has no solution, so that no stable FOPDT process has
         this limit cycle.
     """
-    w0 = 2.0 * math.pi / period
+    ratio = amplitude / (mu * response)
 
-    def mismatch(log_t: float) -> float:
-        t = math.exp(log_t)
-        reach = mu * response * math.hypot(w0 * t, 1.0)
-        # Eq 25 with the exponential taken to the other side, so that nothing overflows.
-        return reach * -math.expm1(-period / (2.0 * t)) - amplitude * (
-            1.0 + math.exp(-period / (2.0 * t))
-        )
+    def excess(q: float) -> float:
+        # It falls from an integrator's pi/2 to 1.
+        return math.tanh(q) * math.hypot(0.5 * math.pi / q, 1.0) - ratio
 
-    grid = np.linspace(math.log(period * 1e-4), math.log(period * 1e4), 400)
-    values = np.array([mismatch(x) for x in grid])
-    signs = np.flatnonzero(values[:-1] * values[1:] < 0.0)
-    if signs.size == 0:
+    low, high = _SMALLEST_Q, _LARGEST_Q
+    if not excess(low) > 0.0 > excess(high):
         raise IdentificationError(
             f"no stable FOPDT process has a limit cycle of period {period:g} s, amplitude "
             f"{amplitude:g} and |G| = {response:g} at its fundamental: the process is of another "
             "structure, or noise spoils the peaks; try the waveform method"
         )
-    i = int(signs[-1])
-    t = math.exp(float(brentq(mismatch, grid[i], grid[i + 1], xtol=1e-300, rtol=1e-15)))
-    k = response * math.hypot(w0 * t, 1.0)
-    return fopdt_with_gain(k, period, amplitude, mu, epsilon)
+    q = float(brentq(excess, low, high, xtol=1e-300, rtol=1e-15))
+    return fopdt_with_gain(amplitude / (mu * math.tanh(q)), period, amplitude, mu, epsilon)
 
 
 def fopdt_with_gain(
@@ -145,9 +140,10 @@ def fopdt_with_gain(
     :param epsilon: its hysteresis [y].
     :raises IdentificationError: if no FOPDT process of this gain has the limit cycle.
     """
-    whole = _log_ratio(mu * gain + amplitude, mu * gain - amplitude, "eq 21")
-    dead = _log_ratio(mu * gain - epsilon, mu * gain - amplitude, "eq 22")
-    return gain, 0.5 * period / whole, 0.5 * period * dead / whole
+    _log_ratio(mu * gain + amplitude, mu * gain - amplitude, "eq 21")
+    _log_ratio(mu * gain - epsilon, mu * gain - amplitude, "eq 22")
+    q = math.atanh(amplitude / (mu * gain))
+    return gain, *first_order(q, period, amplitude, mu, epsilon)[1:]
 
 
 def _log_ratio(numerator: float, denominator: float, where: str) -> float:
@@ -205,7 +201,7 @@ def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
         bias = sign * settings.bias - (settings.setpoint + about - rest.value - error) / k
         high, low = (high, low)[::sign]
         cycle = FopdtCycle(high, low, up - about, down - about)
-        epsilon = max(0.5 * sign * (at_low - at_high), 0.0)
+        epsilon = 0.5 * sign * (at_low - at_high)
         return fopdt_from_biased(cycle, k, settings.amplitude, bias, epsilon)
 
     def features(seen: Fold) -> FloatArray:
@@ -213,6 +209,9 @@ def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
         return np.array((seen.period_high, seen.period_low, *seen.peaks(), *at, gain.value, 0.0))
 
     found, covariance = _features(test, record, features)
+    if sign * (found[5] - found[4]) < 0.0:
+        # Noise put the levels in the order in which no relay switches.
+        found[4:6] = np.mean(found[4:6])
     if covariance is not None:
         covariance[6, 6] = gain.scatter**2
         covariance[7, 7] = rest.std**2 if rest.measured else 0.0
@@ -241,16 +240,18 @@ def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
         period, amplitude, epsilon, ratio = features.tolist()
         if math.isnan(gain):
             response = amplitude / (mu * ratio)
-            return fopdt_from_unbiased(period, amplitude, response, mu, max(epsilon, 0.0))
-        return fopdt_with_gain(gain, period, amplitude, mu, max(epsilon, 0.0))
+            return fopdt_from_unbiased(period, amplitude, response, mu, epsilon)
+        return fopdt_with_gain(gain, period, amplitude, mu, epsilon)
 
     def features(seen: Fold) -> FloatArray:
         down, up = seen.peaks()
         amplitude = 0.5 * (up - down)
         ratio = amplitude / (mu * abs(seen.fundamental())) if math.isnan(gain) else 1.0
-        return np.array((seen.period, amplitude, as_switched(seen).hysteresis, ratio))
+        return np.array((seen.period, amplitude, level_at_switch(seen), ratio))
 
     found, covariance = _features(test, record, features)
+    # Noise may put it below zero, where no relay switches; the scatter is to both sides.
+    found[2] = max(found[2], 0.0)
     remark = ""
     if math.isnan(gain) and covariance is not None:
         ratio, std = _likely_ratio(float(found[3]), math.sqrt(covariance[3, 3]))

@@ -442,13 +442,22 @@ def as_switched(seen: Fold) -> RelaySettings:
 
     :param seen: the averaged period.
     """
-    at_high, at_low = (float(v) for v in seen(np.array([0.0, seen.period_high])))
-    half = 0.5 * (at_low - at_high) * (-1.0 if seen.settings.reverse_acting else 1.0)
+    middle = 0.5 * float(np.sum(seen(np.array([0.0, seen.period_high]))))
     return replace(
         seen.settings,
-        setpoint=seen.settings.setpoint + 0.5 * (at_high + at_low),
-        hysteresis=max(half, 0.0),
+        setpoint=seen.settings.setpoint + middle,
+        hysteresis=max(level_at_switch(seen), 0.0),
     )
+
+
+def level_at_switch(seen: Fold) -> float:
+    """Return half the distance of the levels at which the relay was seen to switch [y].
+
+    :param seen: the averaged period.
+    :return: negative where noise put them in the order in which no relay switches.
+    """
+    at_high, at_low = (float(v) for v in seen(np.array([0.0, seen.period_high])))
+    return 0.5 * (at_low - at_high) * (-1.0 if seen.settings.reverse_acting else 1.0)
 
 
 def _overlaid(

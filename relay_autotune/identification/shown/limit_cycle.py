@@ -273,6 +273,15 @@ class CycleReader:
             return cls(0.0, False)
         return cls(min(_excess_of_peaks(whole, noise), 0.5 * float(amplitude)), True)
 
+    def level(self, stretch: CycleRun) -> float:
+        """Return the measurement at a switch, from the middle of the peaks [y].
+
+        Noise may put it below zero, where no relay switches.
+
+        :param stretch: the cycles.
+        """
+        return _level_at_switch(stretch, self.noisy)
+
     def read(self, stretch: CycleRun, dead_time: float) -> SymmetricCycle:
         """Return the numbers of some cycles.
 
@@ -288,7 +297,7 @@ class CycleReader:
                 "amplitude of the relay"
             )
         delay = dead_time + settings.extra_delay
-        level = _level_at_switch(stretch, self.noisy)
+        level = self.level(stretch)
         return SymmetricCycle(
             period,
             amplitude - self.excess,
