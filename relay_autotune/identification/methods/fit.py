@@ -142,7 +142,9 @@ class Fit:
         :return: shape (n, m).
         """
         low, high = self.ends
-        inside = np.flatnonzero(np.minimum(x - low, high - x) > _AT_END * self._scale)
+        # The largest dead time is a limit of the search, not of what the numbers allow.
+        above = np.where(self._linear, np.inf, high - x)
+        inside = np.flatnonzero(np.minimum(x - low, above) > _AT_END * self._scale)
         room = np.where(self._linear, 0.5 * x, np.inf)
         sides = np.diag(np.minimum(_DIFFERENCE * self._scale, room))[inside]
         here = self._errors(x)
