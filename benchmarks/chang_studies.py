@@ -24,16 +24,11 @@ from relay_autotune import threads  # noqa: F401  before numpy
 import numpy as np
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.methods.atv import (
-    phase_of_lags,
-    time_constant_from_magnitude,
-    time_constant_from_phase,
-    ultimate_estimate,
-)
-from relay_autotune.identification.methods.chang import (
-    time_constant_from_period,
-    two_time_constants,
-)
+from relay_autotune.identification.methods.atv import ultimate_estimate
+from relay_autotune.identification.methods.lags import equal, solutions, with_amplitude
+from relay_autotune.identification.methods.square_wave import EXACT, FIRST, MIXED, Wave
+from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
+from relay_autotune.process.structures import SOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Plant
@@ -90,11 +85,11 @@ def errors_of(
 def figure_2() -> str:
     """Return the multiplicative error over frequency."""
     gain, dead_time = EXAMPLE.gain, EXAMPLE.dead_time
-    k_u, _ = ultimate_estimate(READ_PERIOD, READ_AMPLITUDE, RELAY)
+    cycle = SymmetricCycle(READ_PERIOD, READ_AMPLITUDE, RELAY, 0.0, dead_time)
     constants = {
-        "eq 8": time_constant_from_period(1, READ_PERIOD, dead_time),
-        "eq 13": time_constant_from_phase(1, READ_PERIOD, phase_of_lags(READ_PERIOD, dead_time)),
-        "eq 21": time_constant_from_magnitude(1, READ_PERIOD, gain * k_u),
+        "eq 8": equal(1, cycle)[1],
+        "eq 13": equal(1, cycle, wave=FIRST)[1],
+        "eq 21": with_amplitude((1.0,), READ_PERIOD, READ_AMPLITUDE / (gain * RELAY), FIRST)[0],
     }
     rows = []
     for w in FREQUENCIES:
@@ -116,13 +111,15 @@ def figure_3() -> str:
         read = float(f"{period:.4g}")
 
         def by_period(period: float, dead_time: float = dead_time) -> TransferFunction:
-            tau = time_constant_from_period(1, period, dead_time)
+            _, tau = equal(1, SymmetricCycle(period, 1.0, 1.0, 0.0, dead_time), 1.0)
             return TransferFunction.fopdt(1.65, tau, dead_time)
 
         rows.append(
             [
                 f"{dead_time:g}",
-                *percent(ultimate_estimate(period, amplitude, 1.0), truth),
+                *percent(
+                    ultimate_estimate(SymmetricCycle(period, amplitude, 1.0, 0.0, 0.0)), truth
+                ),
                 *errors_of(by_period, truth, period),
                 *errors_of(by_period, truth, read),
             ]
@@ -136,16 +133,26 @@ def two_lags(dead_time: float) -> TransferFunction:
     return TransferFunction.sopdt(37.3, (7200.0, 2.0), dead_time)
 
 
+def two_lags_of(period: float, dead_time: float, amplitude: float, wave: Wave) -> TransferFunction:
+    """Return two lags of the paper's gain by eqs 11 and 24."""
+    cycle = SymmetricCycle(period, amplitude, 1.0, 0.0, dead_time)
+    _, *lags = solutions(SOPDT, cycle, 37.3, wave)[0]
+    return TransferFunction.sopdt(37.3, tuple(lags), dead_time)
+
+
 def figure_4() -> str:
     """Return the errors of K_u and w_u for two lags over the dead time."""
     rows = []
     for dead_time in SOPDT_DEAD_TIMES:
         model = two_lags(dead_time)
         truth, (period, amplitude) = ultimate(model), limit_cycle(model)
-        cells = [f"{dead_time:g}", *percent(ultimate_estimate(period, amplitude, 1.0), truth)]
-        for harmonics in (1, None):
-            lags = two_time_constants(period, dead_time, amplitude / 37.3, 0.0, harmonics)
-            cells += percent(ultimate(TransferFunction.sopdt(37.3, lags, dead_time)), truth)
+        cells = [
+            f"{dead_time:g}",
+            *percent(ultimate_estimate(SymmetricCycle(period, amplitude, 1.0, 0.0, 0.0)), truth),
+        ]
+        for wave in (MIXED, EXACT):
+            found = two_lags_of(period, dead_time, amplitude, wave)
+            cells += percent(ultimate(found), truth)
         rows.append(cells)
     headings = ["D [s]", "ATV: K_u", "w_u", "eqs 11, 24: K_u", "w_u", "all harmonics: K_u", "w_u"]
     return table(headings, rows)
@@ -174,13 +181,12 @@ def internal_model_control(
 
 def figure_5(period: float) -> str:
     """Return how IMC with each model follows the trajectory that it was designed for."""
-    cycle = limit_cycle(EXAMPLE)
-    k_u, _ = ultimate_estimate(*cycle, 1.0)
-    by_phase = time_constant_from_phase(1, cycle[0], phase_of_lags(cycle[0], 10.0))
-    by_magnitude = time_constant_from_magnitude(1, cycle[0], 1.65 * k_u)
+    cycle = SymmetricCycle(*limit_cycle(EXAMPLE), 1.0, 0.0, 10.0)
+    _, by_phase = equal(1, cycle, wave=FIRST)
+    (by_magnitude,) = with_amplitude((1.0,), cycle.period, cycle.amplitude / 1.65, FIRST)
     models = {
         "the process itself": 20.0,
-        "eq 8": time_constant_from_period(1, cycle[0], 10.0),
+        "eq 8": equal(1, cycle)[1],
         "ATV, mean of eqs 13 and 21": 0.5 * (by_phase + by_magnitude),
     }
     rows = []
@@ -212,17 +218,15 @@ def figure_6() -> str:
     """Return the errors of K_u and w_u over an error of the dead time, for two lags."""
     model = two_lags(1.0)
     truth, (period, amplitude) = ultimate(model), limit_cycle(model)
-    atv = percent(ultimate_estimate(period, amplitude, 1.0), truth)
+    atv = percent(ultimate_estimate(SymmetricCycle(period, amplitude, 1.0, 0.0, 0.0)), truth)
     rows = []
     for error in SOPDT_ERRORS:
         dead_time = 1.0 + error
 
-        def fitted(harmonics: int | None, dead_time: float = dead_time) -> TransferFunction:
-            lags = two_time_constants(period, dead_time, amplitude / 37.3, 0.0, harmonics)
-            return TransferFunction.sopdt(37.3, lags, dead_time)
-
-        literal = errors_of(fitted, truth, 1)
-        exact = errors_of(fitted, truth, None)
+        literal, exact = (
+            errors_of(two_lags_of, truth, period, dead_time, amplitude, wave)
+            for wave in (MIXED, EXACT)
+        )
         rows.append([f"{100.0 * error:+.0f}", *atv, *literal, *exact])
     headings = ["ATV: K_u", "w_u", "eqs 11, 24: K_u", "w_u", "all harmonics: K_u", "w_u"]
     return table(["error of D [%]", *headings], rows)
@@ -232,12 +236,12 @@ def figure_6_one_lag() -> str:
     """Return the same for one lag with a short dead time, as the paper's text has it."""
     model = TransferFunction.fopdt(1.65, 20.0, 1.0)
     truth, (period, amplitude) = ultimate(model), limit_cycle(model)
-    atv = percent(ultimate_estimate(period, amplitude, 1.0), truth)
+    atv = percent(ultimate_estimate(SymmetricCycle(period, amplitude, 1.0, 0.0, 0.0)), truth)
     rows = []
     for error in FOPDT_ERRORS:
         dead_time = 1.0 + error
         try:
-            tau = time_constant_from_period(1, period, dead_time)
+            _, tau = equal(1, SymmetricCycle(period, 1.0, 1.0, 0.0, dead_time), 1.0)
             found = percent(ultimate(TransferFunction.fopdt(1.65, tau, dead_time)), truth)
             rows.append([f"{100.0 * error:+.0f}", *atv, f"{tau:.2f}", *found])
         except IdentificationError:
@@ -255,13 +259,15 @@ def hysteresis() -> str:
         period, amplitude = limit_cycle(EXAMPLE, epsilon)
 
         def by_period(level: float, period: float = period) -> TransferFunction:
-            tau = time_constant_from_period(1, period, 10.0, level)
+            _, tau = equal(1, SymmetricCycle(period, 1.0, 1.0, level, 10.0), 1.0)
             return TransferFunction.fopdt(1.65, tau, 10.0)
 
         rows.append(
             [
                 f"{100.0 * share:g}",
-                *percent(ultimate_estimate(period, amplitude, 1.0), truth),
+                *percent(
+                    ultimate_estimate(SymmetricCycle(period, amplitude, 1.0, 0.0, 0.0)), truth
+                ),
                 *errors_of(by_period, truth, 0.0),
                 *errors_of(by_period, truth, epsilon / 1.65),
             ]

@@ -28,13 +28,16 @@ from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.judgement.assessment import integrated_error, validate
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
+from relay_autotune.identification.methods.lags import equal
+from relay_autotune.identification.methods.square_wave import EXACT, FIRST
 from relay_autotune.identification.methods.thyagarajan2003 import (
+    HIGHER_ORDER,
+    SMALL_DEAD_TIME,
     flat_fopdt,
     fopdt,
-    higher_order,
-    small_dead_time,
     unstable_fopdt,
 )
+from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.identification.shown.shape import Shape, shape_of_half_cycle, shape_of_record
 from relay_autotune.process.simulation import HalfCycle, RelayRun, simulate_relay
 from relay_autotune.process.structures import UNSTABLE_FOPDT
@@ -104,14 +107,20 @@ def flat_of(shape: Shape, level: float | None = None) -> TransferFunction:
 
 def two_lags_of(shape: Shape, level: float | None = None) -> TransferFunction:
     """Return the model of category 2."""
-    gain, tau, dead_time = small_dead_time(shape.period, shape.amplitude, 1.0, level=level)
-    return TransferFunction.lag_n(gain, tau, 2, dead_time)
+    return _equal_lags_of(2, shape, level, SMALL_DEAD_TIME)
 
 
 def five_lags_of(shape: Shape, level: float | None = None) -> TransferFunction:
     """Return the model of category 3."""
-    gain, tau = higher_order(shape.period, shape.amplitude, 1.0, level=level)
-    return TransferFunction.lag_n(gain, tau, 5, 0.0)
+    return _equal_lags_of(HIGHER_ORDER, shape, level, 0.0)
+
+
+def _equal_lags_of(
+    order: int, shape: Shape, level: float | None, ratio: float
+) -> TransferFunction:
+    cycle = SymmetricCycle(shape.period, shape.amplitude, 1.0, 0.0, 0.0, level or 0.0)
+    gain, tau = equal(order, cycle, wave=FIRST if level is None else EXACT, ratio=ratio)
+    return TransferFunction.lag_n(gain, tau, order, ratio * tau)
 
 
 def least_error(model: TransferFunction, shape: Shape) -> str:

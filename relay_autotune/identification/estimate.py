@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.errors import ModelError
+from relay_autotune.errors import IdentificationError, ModelError
 from relay_autotune.process.structures import GivenModel, Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import NORMAL_95
@@ -71,6 +71,54 @@ def exact_steps(
     :param least: lower bound of the point after a step back, shape (p,).
     """
     return (at + size) - at, at - np.maximum(at - size, least)
+
+
+# Steps in standard deviations: the first at which there is a value.
+_SHARES = (1.0, 0.1, 0.01, 1e-3)
+
+
+def carried(
+    function: Callable[[FloatArray], FloatArray], at: FloatArray, covariance: FloatArray
+) -> FloatArray:
+    """Return the covariance of a function of uncertain numbers, by one step along each axis.
+
+    The steps are one standard deviation along the principal axes of the covariance, to both sides
+    where the function has a value there, and less where it has one on none. For the solution x of
+    equations f(x, z) = 0 in the numbers z this is the implicit function theorem,
+    dx = -(df/dx)^-1 (df/dz) dz.
+
+    :param function: from numbers, shape (n,), to values, shape (p,); where it raises an
+        ``IdentificationError`` it has none.
+    :param at: the numbers, shape (n,).
+    :param covariance: of the numbers, shape (n, n).
+    :return: shape (p, p); NaN where the function has a value on no side of an axis.
+    """
+    here = function(at)
+    if not np.all(np.isfinite(covariance)):
+        return np.full((here.size, here.size), math.nan)
+    scale = np.sqrt(np.diag(covariance))
+    used = scale > 0.0
+    alone = scale[used]
+    size, axes = np.linalg.eigh(covariance[np.ix_(used, used)] / np.outer(alone, alone))
+    steps = np.zeros((size.size, at.size))
+    steps[:, used] = (axes * np.sqrt(np.maximum(size, 0.0))).T * alone
+
+    def change(step: FloatArray) -> FloatArray:
+        for share in _SHARES:
+            ends = []
+            for side in (share, -share):
+                try:
+                    ends.append(function(at + side * step))
+                except IdentificationError:
+                    continue
+            if len(ends) == 2:
+                return (ends[0] - ends[1]) / (2.0 * share)
+            if ends:
+                return (ends[0] - here) / share
+        return np.full(here.size, math.nan)
+
+    root = np.array([change(step) for step in steps]).reshape(-1, here.size)
+    return np.asarray(root.T @ root)
 
 
 # Largest change of a logarithm. Steps for derivatives: their bounds, and their share of a

@@ -19,14 +19,16 @@ from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.atv import (
     atv_from_numbers,
     identify_atv,
-    phase_of_lags,
-    time_constant_from_magnitude,
-    time_constant_from_phase,
-    two_equal_and_one,
-    two_time_constants,
     ultimate_estimate,
 )
-from relay_autotune.identification.methods.lags import MODEL_4, MODEL_5
+from relay_autotune.identification.methods.lags import (
+    MODEL_4,
+    MODEL_5,
+    equal,
+    solutions,
+    with_amplitude,
+)
+from relay_autotune.identification.methods.square_wave import FIRST
 from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import equal_lags
@@ -47,32 +49,29 @@ LAGS = [
 
 def test_equation_13():
     ((_, inputs, exact, tol),) = cases("chang.ex1.tau_eq13")
-    phase = phase_of_lags(inputs["P"], inputs["D"])
-    found = time_constant_from_phase(1, inputs["P"], phase)
+    _, found = equal(1, SymmetricCycle(inputs["P"], 1.0, 1.0, 0.0, inputs["D"]), wave=FIRST)
     assert found == pytest.approx(exact, rel=tol)
 
 
 def test_equation_21():
     ((_, inputs, exact, tol),) = cases("chang.ex1.tau_eq21")
-    k_u, _ = ultimate_estimate(inputs["P"], inputs["a"], inputs["h"])
-    found = time_constant_from_magnitude(1, inputs["P"], inputs["K"] * k_u)
-    assert found == pytest.approx(exact, rel=tol)
+    relative = inputs["a"] / (inputs["K"] * inputs["h"])
+    assert with_amplitude((1.0,), inputs["P"], relative, FIRST) == pytest.approx([exact], rel=tol)
 
 
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("atv.wang.T2"))
 def test_the_atv_column_of_wangs_table_2(name, inputs, exact, tol):
     model = TransferFunction.fopdt(inputs["K"], inputs["T"], inputs["L"])
     cycle = exact_limit_cycle(model, RelaySettings(0.0, 0.0, inputs["h"]))
-    k_u, _ = ultimate_estimate(cycle.period, cycle.peak_max, inputs["h"])
-    found = time_constant_from_magnitude(1, cycle.period, inputs["K"] * k_u)
-    assert found == pytest.approx(exact, rel=tol)
+    relative = cycle.peak_max / (inputs["K"] * inputs["h"])
+    assert with_amplitude((1.0,), cycle.period, relative, FIRST) == pytest.approx([exact], rel=tol)
 
 
 @pytest.mark.parametrize("figure", ["chang.fig3", "chang.fig4"])
 def test_errors_of_equations_1_and_2(figure):
     ((_, _, rows, _),) = cases(figure)
     for row in rows:
-        k_u, w_u = ultimate_estimate(row["P"], row["a_over_h"], 1.0)
+        k_u, w_u = ultimate_estimate(SymmetricCycle(row["P"], row["a_over_h"], 1.0, 0.0, 0.0))
         errors = (100.0 * (k_u / row["Ku_true"] - 1.0), 100.0 * (w_u / row["wu_true"] - 1.0))
         wanted = (row["Ku_err_atv_pct"], row["wu_err_atv_pct"])
         assert errors == pytest.approx(wanted, rel=1e-6)
@@ -87,12 +86,10 @@ def test_a_limit_cycle_of_the_describing_function_gives_the_process(model, const
     amplitude, w = _describing_function(process, relay, epsilon)
     cycle = SymmetricCycle(2.0 * math.pi / w, amplitude, relay, epsilon, dead_time)
     found = atv_from_numbers(cycle, Known(gain=2.0, structure=model.name, order=model.order))
-    solutions = [found.values[1:-1]]
+    every = [found.values[1:-1]]
     if model == MODEL_5:
-        k_u, _ = ultimate_estimate(cycle.period, amplitude, relay)
-        phase = phase_of_lags(cycle.period, dead_time, amplitude, epsilon)
-        solutions = [np.array(s) for s in two_equal_and_one(cycle.period, phase, 2.0 * k_u)]
-    assert min(np.abs(s / constants - 1.0).max() for s in solutions) < 1e-9
+        every = [np.array(s[1:]) for s in solutions(model, cycle, 2.0, FIRST)]
+    assert min(np.abs(s / constants - 1.0).max() for s in every) < 1e-9
     if epsilon == 0.0 and model != MODEL_5:
         assert found.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=1e-9)
         chosen = atv_from_numbers(cycle, Known(gain=2.0))
@@ -124,7 +121,7 @@ def test_the_mean_of_phase_and_magnitude():
     found = atv_from_numbers(cycle, Known(gain=inputs["K"]))
     parts = [c[2] for c in cases("chang.ex1.tau_eq13", "chang.ex1.tau_eq21")]
     assert found.values == pytest.approx([1.65, sum(parts) / 2.0, 10.0], rel=1e-9)
-    k_u, w_u = ultimate_estimate(exact["P"], exact["a"], inputs["h"])
+    k_u, w_u = ultimate_estimate(cycle)
     assert (found.ultimate_gain, found.ultimate_frequency) == (k_u, w_u)
     assert found.warnings == ()
 
@@ -135,24 +132,26 @@ def test_without_the_gain_phase_and_magnitude_are_used_up():
     found = atv_from_numbers(cycle, Known())
     assert found.values[1] == pytest.approx(cases("chang.ex1.tau_eq13")[0][2], rel=1e-9)
     point = ultimate_point(found.model)
-    assert (point.gain, point.frequency) == pytest.approx(
-        ultimate_estimate(exact["P"], exact["a"], inputs["h"]), rel=1e-9
-    )
+    assert (point.gain, point.frequency) == pytest.approx(ultimate_estimate(cycle), rel=1e-9)
     assert any("structure is not checked" in w for w in found.warnings)
 
 
 def test_numbers_that_cannot_be_are_refused():
-    with pytest.raises(IdentificationError, match="alone has more phase"):
-        phase_of_lags(10.0, 5.0)
+    def at(dead_time: float, hysteresis: float = 0.0) -> SymmetricCycle:
+        return SymmetricCycle(10.0, 1.0, 1.0, hysteresis, dead_time)
+
+    with pytest.raises(IdentificationError, match="less than half the period"):
+        equal(1, at(5.0), wave=FIRST)
     with pytest.raises(IdentificationError, match="not above the hysteresis"):
-        phase_of_lags(10.0, 1.0, 1.0, 1.0)
-    with pytest.raises(IdentificationError, match="1 lag cannot make up"):
-        time_constant_from_phase(1, 10.0, 1.6)
-    with pytest.raises(IdentificationError, match="not above 1"):
-        time_constant_from_magnitude(1, 10.0, 0.9)
-    for pair in (two_time_constants, two_equal_and_one):
-        with pytest.raises(IdentificationError, match="another structure"):
-            pair(10.0, 3.1, 2.0)
+        equal(1, at(1.0, 1.0), wave=FIRST)
+    with pytest.raises(IdentificationError, match=r"of 1 equal lags .* misread"):
+        # A phase of more than a quarter turn is left.
+        equal(1, at(2.4), wave=FIRST)
+    with pytest.raises(IdentificationError, match="gain given is too small"):
+        with_amplitude((1.0,), 10.0, 1.3, FIRST)
+    for model in (MODEL_4, MODEL_5):
+        with pytest.raises(IdentificationError, match=r"less lag than .* model 1"):
+            solutions(model, at(4.0), 2.0, FIRST)
     with pytest.raises(IdentificationError, match="needs the gain"):
         atv_from_numbers(SymmetricCycle(10.0, 1.0, 1.0, 0.0, 1.0), Known(structure="sopdt"))
 

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from forward import peak_of_harmonics
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sampled_relay import exact_limit_cycle, simulate_sampled_relay
@@ -17,19 +18,20 @@ from worked_cases import cases
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
-from relay_autotune.identification.methods.chang import (
-    chang_from_numbers,
-    gain_and_time_constant,
-    identify_chang,
-    time_constant_from_amplitude,
-    time_constant_from_period,
-    two_equal_and_one,
-    two_time_constants,
+from relay_autotune.identification.methods.chang import chang_from_numbers, identify_chang
+from relay_autotune.identification.methods.lags import equal, solutions, with_amplitude
+from relay_autotune.identification.methods.square_wave import (
+    EXACT,
+    MIXED,
+    Wave,
+    fundamental,
+    level,
+    peak,
+    slope_sign,
 )
-from relay_autotune.identification.methods.lags import fundamental, level, peak, slope_sign
 from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.process.simulation import simulate_relay
-from relay_autotune.process.structures import TWO_EQUAL_ONE
+from relay_autotune.process.structures import SOPDT, TWO_EQUAL_ONE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record, RelaySettings
@@ -50,6 +52,40 @@ PROCESSES = [
     TWO_EQUAL_ONE.build((2.0, 3.0, 3.02, 1.0)),
 ]
 RELAY = 0.7
+
+
+def time_constant_from_period(
+    order: int, period: float, dead_time: float, at_switch: float = 0.0
+) -> float:
+    """Return tau of equal lags of gain 1 under a relay of amplitude 1."""
+    return equal(order, SymmetricCycle(period, 1.0, 1.0, at_switch, dead_time), 1.0)[1]
+
+
+def gain_and_time_constant(
+    order: int,
+    period: float,
+    amplitude: float,
+    dead_time: float,
+    relay: float,
+    hysteresis: float = 0.0,
+) -> tuple[float, float]:
+    """Return K and tau of equal lags."""
+    return equal(order, SymmetricCycle(period, amplitude, relay, hysteresis, dead_time))
+
+
+def time_constant_from_amplitude(
+    order: int, period: float, relative: float, wave: Wave = MIXED
+) -> float:
+    """Return tau of equal lags."""
+    return with_amplitude((1.0 / order,) * order, period, relative, wave)[0]
+
+
+def unequal(
+    structure, period: float, dead_time: float, relative: float, at_switch: float, wave: Wave
+) -> list[tuple[float, ...]]:
+    """Return the time constants of model 4 or 5 of gain 1 under a relay of amplitude 1."""
+    cycle = SymmetricCycle(period, relative, 1.0, at_switch, dead_time)
+    return [found[1:] for found in solutions(structure, cycle, 1.0, wave)]
 
 
 def _lags(model: TransferFunction) -> tuple[float, ...]:
@@ -119,16 +155,16 @@ def test_the_generalised_equations_return_the_process(model, share):
     )
     assert peak(lags, period) == pytest.approx(relative, rel=1e-9)
     if model.structure == "sopdt":
-        found = two_time_constants(period, dead_time, relative, at_switch, None)
+        (found,) = unequal(SOPDT, period, dead_time, relative, at_switch, EXACT)
         assert found == pytest.approx(lags, rel=1e-7)
     elif model.structure == "two_equal_one":
-        solutions = two_equal_and_one(period, dead_time, relative, at_switch, None)
-        away = [abs(a / lags[0] - 1.0) + abs(b / lags[2] - 1.0) for a, b in solutions]
+        found = unequal(TWO_EQUAL_ONE, period, dead_time, relative, at_switch, EXACT)
+        away = [abs(a / lags[0] - 1.0) + abs(b / lags[2] - 1.0) for a, b in found]
         assert min(away) < 1e-6
     else:
         n, tau = len(lags), lags[0]
         by_period = time_constant_from_period(n, period, dead_time, at_switch)
-        by_amplitude = time_constant_from_amplitude(n, period, relative, None)
+        by_amplitude = time_constant_from_amplitude(n, period, relative, EXACT)
         both = gain_and_time_constant(n, period, amplitude, dead_time, RELAY, epsilon)
         assert by_period == pytest.approx(tau, rel=1e-9)
         assert by_amplitude == pytest.approx(tau, rel=1e-9)
@@ -142,10 +178,10 @@ def test_the_papers_iteration_over_harmonics_converges_to_the_exact_time_constan
     tau = time_constant_from_amplitude(2, period, relative)
     assert abs(tau / 3.0 - 1.0) > 0.01
     for _ in range(10):
-        ratio = peak((tau, tau), period, 200) / fundamental((tau, tau), period)
+        ratio = peak_of_harmonics((tau, tau), period, 200) / fundamental((tau, tau), period)
         tau = time_constant_from_amplitude(2, period, relative / ratio)
     assert tau == pytest.approx(3.0, rel=1e-6)
-    assert time_constant_from_amplitude(2, period, relative, 200) == pytest.approx(tau, rel=1e-7)
+    assert time_constant_from_amplitude(2, period, relative, EXACT) == pytest.approx(tau, rel=1e-6)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -173,9 +209,9 @@ def test_figure_3(case):
 def test_figure_4(case):
     period, relative, dead_time = case["P"], case["a_over_h"] / 37.3, case["D"]
     truth = (case["Ku_true"], case["wu_true"])
-    exact = two_time_constants(period, dead_time, relative, 0.0, None)
+    (exact,) = unequal(SOPDT, period, dead_time, relative, 0.0, EXACT)
     assert exact == pytest.approx((7200.0, 2.0), rel=1e-6)
-    literal = two_time_constants(period, dead_time, relative)
+    (literal,) = unequal(SOPDT, period, dead_time, relative, 0.0, MIXED)
     errors = []
     for lags in (exact, literal):
         point = ultimate_point(TransferFunction.sopdt(37.3, lags, dead_time))
@@ -206,7 +242,7 @@ def test_one_lag_is_refused_outside_its_existence():
 @pytest.mark.long
 def test_numbers_that_cannot_be_are_refused():
     with pytest.raises(IdentificationError, match="amplitude"):
-        time_constant_from_amplitude(1, 10.0, 1.5, None)
+        time_constant_from_amplitude(1, 10.0, 1.5, EXACT)
     with pytest.raises(IdentificationError, match="amplitude"):
         time_constant_from_amplitude(1, 10.0, 1.5)
     with pytest.raises(IdentificationError, match="hysteresis"):
@@ -215,13 +251,13 @@ def test_numbers_that_cannot_be_are_refused():
         gain_and_time_constant(1, 10.0, 1.0, 3.0, 1.0, 1.0)
     period, amplitude, _ = _cycle(PROCESSES[0], 0.0)
     with pytest.raises(IdentificationError, match="less lag"):
-        two_time_constants(period, 1.2, amplitude / (2.0 * RELAY), 0.0, None)
+        unequal(SOPDT, period, 1.2, amplitude / (2.0 * RELAY), 0.0, EXACT)
     period, amplitude, _ = _cycle(PROCESSES[3], 0.0)
     with pytest.raises(IdentificationError, match="more lag"):
-        two_time_constants(period, 1.0, amplitude / (2.0 * RELAY), 0.0, None)
+        unequal(SOPDT, period, 1.0, amplitude / (2.0 * RELAY), 0.0, EXACT)
     period, amplitude, _ = _cycle(PROCESSES[4], 0.0)
     with pytest.raises(IdentificationError, match="more lag"):
-        two_equal_and_one(period, 0.1, amplitude / (2.0 * RELAY), 0.0, None)
+        unequal(TWO_EQUAL_ONE, period, 0.1, amplitude / (2.0 * RELAY), 0.0, EXACT)
 
 
 @pytest.mark.nightly

@@ -13,7 +13,8 @@ from sampled_relay import exact_limit_cycle
 from worked_cases import cases
 
 from relay_autotune.errors import ModelError
-from relay_autotune.identification.methods.thyagarajan2003 import lags_from_cycle
+from relay_autotune.identification.methods.lags import equal
+from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.identification.shown.shape import normalised_growth
 from relay_autotune.process.simulation import HalfCycle, simulate_relay
 from relay_autotune.process.structures import INTEGRATOR_INVERSE, UNSTABLE_FOPDT
@@ -84,7 +85,7 @@ def test_growth_of_two_equal_lags(name, inputs, exact, tol):
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.eq28"))
 def test_growth_of_equal_lags_without_dead_time(name, inputs, exact, tol):
     for case in exact:
-        _, tau, _ = lags_from_cycle(case["n"], 1.0, 1.0, 1.0, 0.0)
+        _, tau = equal(case["n"], SymmetricCycle(1.0, 1.0, 1.0, 0.0, 0.0))
         half = HalfCycle(TransferFunction.lag_n(1.0, tau, case["n"], 0.0), 0.5)
         assert normalised_growth(half.multiplier()) == pytest.approx(case["tauG_P"], rel=tol)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from forward import step_features, step_response
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import fsolve
@@ -18,8 +19,6 @@ from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.luyben import (
     from_step,
     identify_step_numbers,
-    step_features,
-    step_response,
 )
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay

@@ -9,13 +9,13 @@ import math
 
 import numpy as np
 import pytest
+from forward import fopdt_limit_cycle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sampled_relay import exact_limit_cycle, simulate_sampled_relay
 from worked_cases import cases
 
 from relay_autotune.errors import ModelError
-from relay_autotune.identification.methods.wang import fopdt_limit_cycle
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import (

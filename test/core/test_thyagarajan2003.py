@@ -9,25 +9,24 @@ import math
 
 import numpy as np
 import pytest
+from forward import first_half, unstable_limit_cycle
 from hypothesis import given
 from hypothesis import strategies as st
 from sampled_relay import exact_limit_cycle
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.methods.lags import equal
+from relay_autotune.identification.methods.square_wave import EXACT, FIRST, Wave
 from relay_autotune.identification.methods.thyagarajan2003 import (
     dead_time_ratio,
-    first_half,
     flat_fopdt,
     fopdt,
-    higher_order,
-    lags_from_cycle,
     order_from_curvature,
     rise_time_constant,
-    small_dead_time,
     unstable_fopdt,
-    unstable_limit_cycle,
 )
+from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.identification.shown.shape import shape_of_half_cycle
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.structures import UNSTABLE_FOPDT
@@ -35,15 +34,25 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 
 
+def equal_lags(
+    order, period, amplitude, relay, level=0.0, *, wave: Wave = EXACT, ratio=0.0, dead_time=0.0
+):
+    """Return (K, tau, D) of equal lags."""
+    cycle = SymmetricCycle(period, amplitude, relay, 0.0, dead_time, level)
+    gain, tau = equal(order, cycle, wave=wave, ratio=ratio)
+    return gain, tau, dead_time + ratio * tau
+
+
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.T2"))
 def test_the_equivalent_models_of_table_2(name, inputs, exact, tol):
     p = inputs
     if name.endswith("SOPSDT"):
-        found = small_dead_time(p["P"], p["a"], 1.0, p["eps"])
+        found = equal_lags(2, p["P"], p["a"], 1.0, wave=FIRST, ratio=p["eps"])
         assert found == pytest.approx(exact["true_pi"], rel=tol)
         return
     if name.endswith("HO"):
-        assert higher_order(p["P"], p["a"], 1.0, p["n"]) == pytest.approx(exact[:2], rel=tol)
+        found = equal_lags(p["n"], p["P"], p["a"], 1.0, wave=FIRST)
+        assert found[:2] == pytest.approx(exact[:2], rel=tol)
         return
     numbers = (p["P"], p["a"], p["t_peak"], p["h"])
     if exact["unstable"] is None:
@@ -61,14 +70,14 @@ def test_the_equivalent_models_of_table_2(name, inputs, exact, tol):
 
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.eq43"))
 def test_eq_43(name, inputs, exact, tol):
-    found = small_dead_time(inputs["P"], inputs["a"], 1.0, inputs["eps"])
+    found = equal_lags(2, inputs["P"], inputs["a"], 1.0, wave=FIRST, ratio=inputs["eps"])
     assert found == pytest.approx(exact["true_pi"], rel=tol)
 
 
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.eq44"))
 def test_eq_44(name, inputs, exact, tol):
     cycle = cases("thy.eq43")[0][1]
-    found = small_dead_time(cycle["P"], cycle["a"], 1.0, inputs["eps"])
+    found = equal_lags(2, cycle["P"], cycle["a"], 1.0, wave=FIRST, ratio=inputs["eps"])
     assert found == pytest.approx(exact["true_pi"], rel=tol)
 
 
@@ -140,7 +149,7 @@ def test_an_unstable_fopdt_process_with_hysteresis(relay, dead_time):
 @pytest.mark.parametrize("ratio", [0.001, 0.01, 0.1])
 def test_two_equal_lags_with_hysteresis(relay, ratio):
     s = reading(TransferFunction.lag_n(1.5, 3.0, 2, 3.0 * ratio), relay)
-    found = small_dead_time(s.period, s.amplitude, 2.0, ratio, relay.hysteresis)
+    found = equal_lags(2, s.period, s.amplitude, 2.0, relay.hysteresis, ratio=ratio)
     assert found == pytest.approx((1.5, 3.0, 3.0 * ratio), rel=1e-9)
 
 
@@ -148,11 +157,11 @@ def test_two_equal_lags_with_hysteresis(relay, ratio):
 @pytest.mark.parametrize("order", [3, 5, 10, 20])
 def test_higher_orders_with_hysteresis(relay, order):
     s = reading(TransferFunction.lag_n(1.5, 3.0, order, 0.0), relay)
-    found = higher_order(s.period, s.amplitude, 2.0, order, relay.hysteresis)
-    assert found == pytest.approx((1.5, 3.0), rel=1e-9)
+    found = equal_lags(order, s.period, s.amplitude, 2.0, relay.hysteresis)
+    assert found == pytest.approx((1.5, 3.0, 0.0), rel=1e-9)
     # and with a dead time that is known
     s = reading(TransferFunction.lag_n(1.5, 3.0, order, 1.0), relay)
-    known = lags_from_cycle(order, s.period, s.amplitude, 2.0, relay.hysteresis, dead_time=1.0)
+    known = equal_lags(order, s.period, s.amplitude, 2.0, relay.hysteresis, dead_time=1.0)
     assert known == pytest.approx((1.5, 3.0, 1.0), rel=1e-9)
 
 
@@ -199,11 +208,9 @@ def test_numbers_of_no_process_are_refused_with_the_reason():
         fopdt(10.0, 1.0, 6.0, 1.0)
     with pytest.raises(IdentificationError, match="exceed"):
         fopdt(10.0, 1.0, 4.0, 1.0, 1.5)
-    with pytest.raises(IdentificationError, match="exceed"):
-        lags_from_cycle(5, 10.0, 1.0, 1.0, 1.5)
-    with pytest.raises(IdentificationError, match="ln 2"):
-        unstable_limit_cycle(1.0, 1.0, 0.7, 1.0)
+    with pytest.raises(IdentificationError, match="not above the hysteresis"):
+        equal_lags(5, 10.0, 1.0, 1.0, 1.5)
     with pytest.raises(IdentificationError, match="at least 3"):
-        higher_order(10.0, 1.0, 1.0, 2)
+        equal_lags(2, 10.0, 1.0, 1.0)
     with pytest.raises(IdentificationError, match="very end"):
         fopdt(10.0, 1.0, 5.0 * (1.0 - 1e-16), 1.0)

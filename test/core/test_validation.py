@@ -100,12 +100,13 @@ def test_a_wrong_model_does_not(wrong):
 
 
 def test_models_of_one_period_and_amplitude_differ_in_shape_only():
-    from relay_autotune.identification.methods.thyagarajan2003 import higher_order
+    from relay_autotune.identification.methods.lags import equal
+    from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 
     relay = RelaySettings(0.0, 0.0, 1.0, 0.0, 0.1)
     run = simulate_relay(FOPDT, relay, cycles=6)
     cycle = run.cycles[-1]
-    gain, tau = higher_order(cycle.period, cycle.peak_max, 1.0, 5, 0.1)
+    gain, tau = equal(5, SymmetricCycle(cycle.period, cycle.peak_max, 1.0, 0.1, 0.0))
     found = validate(TransferFunction.lag_n(gain, tau, 5, 0.0), record_of(FOPDT, relay))
     assert abs(found.period) < 1e-4
     assert abs(found.peak_max) < 1e-3

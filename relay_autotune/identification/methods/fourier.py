@@ -14,17 +14,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import brentq, least_squares
+from scipy.optimize import brentq
 from scipy.special import fdtrc
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate, jacobian
 from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.methods.fit import Fit
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.identification.shown.fourier import (
     FrequencyPoint,
@@ -33,7 +32,12 @@ from relay_autotune.identification.shown.fourier import (
     steady_state,
     with_noise_about,
 )
-from relay_autotune.identification.shown.limit_cycle import NOT_SETTLED, RelayTest, relay_test
+from relay_autotune.identification.shown.limit_cycle import (
+    NOT_SETTLED,
+    RelayTest,
+    known_gain,
+    relay_test,
+)
 from relay_autotune.process.structures import (
     FOPDT,
     INTEGRATOR_LAG,
@@ -139,16 +143,8 @@ METHOD = "fourier"
 
 _UNLIKELY = 1e-3
 _LAGS = (0.1, 0.5, 2.0, 10.0)
-_NO_VALUE = 1e12 * (1.0 + 1.0j)
-_LARGEST, _SMALLEST = 300.0, 1e-300
-_LONGEST = 1e4
 _BEYOND = 1.3
 _STEP = 0.1
-# Step of derivatives, and distance that counts as at an end: in logarithms, or in times of a
-# radian.
-_DIFFERENCE = 1e-4
-_AT_END = 1e-6
-
 
 # Structures beside equal lags: gain, at most one time constant, and dead time.
 _STRUCTURES = {s.name: s for s in (FOPDT, IPDT, INTEGRATOR_LAG, UNSTABLE_FOPDT)}
@@ -190,15 +186,18 @@ def identify_fourier(record: Record, known: Known = NOTHING) -> Identification:
     """
     structure = _structure_asked_for(known)
     test = relay_test(METHOD, record, two_levels=False)
-    fit = _Fit(structure, known, -1 if test.whole.settings.reverse_acting else 1)
+    sign = -1 if test.whole.settings.reverse_acting else 1
+    known_gain(known, sign)
     harmonics = measured_points(test.whole)
     points = _with_static_gain(test, record, harmonics, structure)
-    values, cost = fit.best(points)
+    fit = _fit(structure, known, sign, points)
+    cost, x = _nearest(fit, points)
     if not structure.unstable:
-        harmonics = with_noise_about(structure.build(values), test.whole, harmonics)
+        harmonics = with_noise_about(structure.build(fit.values(x)), test.whole, harmonics)
         points = _with_static_gain(test, record, harmonics, structure)
-        cost, x = fit.refined(fit.searched(values), points)
-        values = fit.values(x)
+        fit = _fit(structure, known, sign, points)
+        cost, x = fit.refined(x)
+    values = fit.values(x)
     remarks = [] if test.whole.cycle.converged else [NOT_SETTLED]
     freedom = points.numbers - fit.free.size
     # The standard deviations are estimates with few degrees of freedom.
@@ -211,7 +210,7 @@ def identify_fourier(record: Record, known: Known = NOTHING) -> Identification:
             "points"
         )
     between = smooth if unlikely else interpolated
-    covariance, ultimate_std = fit.uncertainty(points, values, between)
+    covariance, ultimate_std = _uncertainty(fit, points, x, between)
     covariance = covariance * (cost / freedom if unlikely else 1.0)
     found = identified(METHOD, Estimate.of(structure, values, covariance))
     point = between(found.model, points.frequency, points.value)
@@ -271,186 +270,73 @@ def _structure_asked_for(known: Known) -> Structure:
     return _STRUCTURES[name]
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """Weighted least squares over points, with a gain in the direction of the relay.
+def _fit(structure: Structure, known: Known, sign: int, points: _Points) -> Fit:
+    """Return the least squares over points, with a gain in the direction of the relay."""
 
-    :param structure: of the model.
-    :param known: gain and dead time that are not fitted.
-    :param sign: +1, or -1 for a reverse-acting relay.
-    """
-
-    structure: Structure
-    known: Known
-    sign: int
-
-    def __post_init__(self) -> None:
-        if self.sign * self.known.gain < 0.0:
-            raise IdentificationError(
-                f"a gain of {self.known.gain:g} is against the direction of the relay: the known "
-                "gain has the wrong sign"
-            )
-
-    @cached_property
-    def given(self) -> FloatArray:
-        """The known values; NaN: to be fitted."""
-        facts = {"gain": self.known.gain, "dead_time": self.known.dead_time}
-        return np.array([facts.get(n, math.nan) for n in self.structure.names])
-
-    @cached_property
-    def free(self) -> NDArray[np.intp]:
-        """Indices of the values that are fitted."""
-        return np.flatnonzero(np.isnan(self.given))
-
-    @cached_property
-    def delays(self) -> NDArray[np.bool_]:
-        """Which of the fitted values are a dead time; the others are fitted as logarithms."""
-        return np.asarray(~self.structure.logarithmic[self.free])
-
-    def values(self, x: FloatArray) -> FloatArray:
-        """Return the values of a point of the search."""
-        found = self.given.copy()
-        found[self.free] = np.where(self.delays, x, np.exp(np.where(self.delays, 0.0, x)))
-        if self.free.size and self.free[0] == 0:
-            found[0] *= self.sign
-        return found
-
-    def searched(self, values: FloatArray) -> FloatArray:
-        """Return the point of the search for some values."""
-        at = np.abs(values[self.free])
-        return np.where(self.delays, at, np.log(np.maximum(at, _SMALLEST)))
-
-    def residual(self, x: FloatArray, points: _Points) -> FloatArray:
-        """Return the model's error in each number, over its standard deviation."""
-        model = self.structure.build(self.values(x))
-        with np.errstate(over="ignore", invalid="ignore"):
-            away = (model(1j * points.frequency) - points.value) / points.std
-        # A search that strays meets models without a value: they get a huge error.
-        away = np.where(np.isfinite(away), away, _NO_VALUE)
+    def residual(values: FloatArray) -> FloatArray:
+        model = structure.build(values)
+        away = (model(1j * points.frequency) - points.value) / points.std
         return np.concatenate((away.real, away.imag[points.frequency > 0.0]))
 
-    def refined(self, x: FloatArray, points: _Points) -> tuple[float, FloatArray]:
-        """Return the least sum of squares and where it is, from a start."""
-        if x.size == 0:
-            return float(np.sum(self.residual(x, points) ** 2)), x
-        unit = self._unit(points)
-        solved = least_squares(
-            self.residual,
-            x,
-            bounds=self._bounds(unit),
-            x_scale=np.where(self.delays, unit, 1.0),
-            args=(points,),
-            xtol=1e-12,
-            ftol=1e-12,
-            gtol=1e-12,
-        )
-        return 2.0 * float(solved.cost), solved.x
+    facts = {"gain": known.gain, "dead_time": known.dead_time}
+    given = np.array([facts.get(n, math.nan) for n in structure.names])
+    # A radian at the lowest frequency.
+    unit = 1.0 / float(points.frequency[points.frequency > 0.0][0])
+    return Fit(structure, given, sign, residual, unit)
 
-    def _unit(self, points: _Points) -> float:
-        """Return the time in which a radian passes at the lowest frequency [s]."""
-        return 1.0 / float(points.frequency[points.frequency > 0.0][0])
 
-    def _bounds(self, unit: float) -> tuple[FloatArray, FloatArray]:
-        """Return both ends of the search: the longest lag is an integrator."""
-        ends = {
-            "gain": _LARGEST,
-            "time_constant": math.log(_LONGEST * unit),
-            "dead_time": math.inf,
-        }
-        high = np.array([ends[self.structure.names[i]] for i in self.free])
-        return np.where(self.delays, 0.0, -_LARGEST), high
+def _nearest(fit: Fit, points: _Points) -> tuple[float, FloatArray]:
+    """Return the least sum of squares and where it is."""
+    target = complex(points.value[points.frequency > 0.0][0])
+    names = fit.structure.names
+    starts = []
+    for lag in _LAGS if fit.structure.factors else _LAGS[:1]:
+        start = {"gain": float(fit.sign), "time_constant": lag * fit.unit, "dead_time": 0.0}
+        trial = fit.structure.build(np.array([start[n] for n in names]))
+        ratio = target / complex(trial(1j / fit.unit))
+        # The rest of the phase is dead time.
+        start["gain"] = abs(ratio)
+        start["dead_time"] = (-float(np.angle(ratio)) % (2.0 * math.pi)) * fit.unit
+        starts.append(np.array([start[n] for n in names]))
+    cost, x = fit.best(starts)
+    # Another period of dead time turns each harmonic by whole turns, and fits as well.
+    values = fit.values(x)
+    values[-1] %= 2.0 * math.pi * fit.unit
+    return cost, fit.searched(values)
 
-    def best(self, points: _Points) -> tuple[FloatArray, float]:
-        """Return the values of the nearest model, and its sum of squares."""
-        first = int(np.flatnonzero(points.frequency > 0.0)[0])
-        w, target = float(points.frequency[first]), complex(points.value[first])
-        names = self.structure.names
-        found = []
-        for lag in _LAGS if self.structure.factors else _LAGS[:1]:
-            start = {"gain": float(self.sign), "time_constant": lag / w, "dead_time": 0.0}
-            trial = self.structure.build(np.array([start[n] for n in names]))
-            ratio = target / complex(trial(1j * w))
-            # The rest of the phase is dead time.
-            start["gain"] = abs(ratio)
-            start["dead_time"] = (-float(np.angle(ratio)) % (2.0 * math.pi)) / w
-            found.append(self.refined(self.searched(np.array([start[n] for n in names])), points))
-        cost, x = min(found, key=lambda each: each[0])
-        # Another period of dead time turns each harmonic by whole turns, and fits as well.
-        x = np.where(self.delays, np.mod(x, 2.0 * math.pi / w), x)
-        return self.values(x), cost
 
-    def uncertainty(
-        self, points: _Points, values: FloatArray, between: Interpolation
-    ) -> tuple[FloatArray, tuple[float, float]]:
-        """Return the covariance of the values, and the deviations of K_u and w_u.
+def _uncertainty(
+    fit: Fit, points: _Points, x: FloatArray, between: Interpolation
+) -> tuple[FloatArray, tuple[float, float]]:
+    """Return the covariance of the values, and the deviations of K_u and w_u.
 
-        Each measured number is moved by a share of its deviation; the least of the sum of
-        squares then lies one Newton step away. With fewer numbers than values the covariance is
-        NaN.
+    Each measured number is moved by a share of its deviation; the least of the sum of squares
+    then lies one Newton step away. With fewer numbers than values the covariance is NaN.
 
-        :param points: what was measured.
-        :param values: of the nearest model.
-        :param between: how the ultimate point follows from model, frequencies and points.
-        """
-        x = self.searched(values)
-        steps = self._newton_steps(x, points)
-        ends_of_search = self._bounds(self._unit(points))
-        # In the order of the residuals: all real parts, then the imaginary ones.
-        numbers = [(i, 1.0 + 0.0j) for i in range(points.value.size)]
-        numbers += [(int(i), 1.0j) for i in np.flatnonzero(points.frequency > 0.0)]
-        place = np.array([i for i, _ in numbers])
-        size = points.std[place] * np.array([direction for _, direction in numbers])
+    :param fit: the least squares.
+    :param points: what was measured.
+    :param x: where the sum of squares is least, shape (m,).
+    :param between: how the ultimate point follows from model, frequencies and points.
+    """
+    steps = fit.steps(x)
+    # In the order of the residuals: all real parts, then the imaginary ones.
+    places = np.arange(points.value.size)
+    turned = places[points.frequency > 0.0]
+    place = np.concatenate((places, turned))
+    size = points.std[place] * np.repeat((1.0, 1j), (places.size, turned.size))
 
-        def answer(deviations: FloatArray) -> FloatArray:
-            moved = points.value.copy()
-            np.add.at(moved, place, deviations * size)
-            there = self.values(np.clip(x + deviations @ steps, *ends_of_search))
-            point = between(self.structure.build(there), points.frequency, moved)
-            ultimate = (math.nan,) * 2 if point is None else (point.gain, point.frequency)
-            return np.append(there, ultimate)
+    def answer(deviations: FloatArray) -> FloatArray:
+        moved = points.value.copy()
+        np.add.at(moved, place, deviations * size)
+        there = fit.values(np.clip(x + deviations @ steps, *fit.ends))
+        point = between(fit.structure.build(there), points.frequency, moved)
+        ultimate = (math.nan,) * 2 if point is None else (point.gain, point.frequency)
+        return np.append(there, ultimate)
 
-        none = np.zeros(len(numbers))
-        spread = jacobian(answer, none, none + _STEP)
-        squares = spread @ spread.T
-        if points.numbers < self.free.size:
-            # A single point does not determine three values.
-            squares[:-2, :-2] = math.nan
-        return squares[:-2, :-2], (math.sqrt(squares[-2, -2]), math.sqrt(squares[-1, -1]))
-
-    def _newton_steps(self, x: FloatArray, points: _Points) -> FloatArray:
-        """Return how the minimum moves with each measured number, by one standard deviation.
-
-        ``(J'J + sum_i r_i r_i'')^-1 J'`` with the residuals r and their derivatives J; a value at
-        an end of its range stays there.
-
-        :param x: where the sum of squares is least, shape (p,).
-        :param points: what was measured.
-        :return: shape (numbers, p), in the order of :meth:`residual`.
-        """
-        unit = self._unit(points)
-        scale = np.where(self.delays, unit, 1.0)
-        low, high = self._bounds(unit)
-        inside = np.flatnonzero(np.minimum(x - low, high - x) > _AT_END * scale)
-        room = np.where(self.delays, 0.5 * x, math.inf)
-        sides = np.diag(np.minimum(_DIFFERENCE * scale, room))[inside]
-        here = self.residual(x, points)
-        ahead = np.array([self.residual(x + h, points) - here for h in sides])
-        back = np.array([self.residual(x - h, points) - here for h in sides])
-        steps = np.zeros((points.numbers, x.size))
-        if inside.size == 0:
-            return steps
-        size = sides.max(axis=1)[:, None]
-        jacobian = (ahead - back) / (2.0 * size)
-        hessian = jacobian @ jacobian.T
-        for i, a in enumerate(sides):
-            hessian[i, i] += here @ (ahead[i] + back[i]) / size[i, 0] ** 2
-            for k in range(i):
-                both = self.residual(x + a + sides[k], points) - here
-                both += self.residual(x - a - sides[k], points) - here
-                mixed = both - ahead[i] - back[i] - ahead[k] - back[k]
-                hessian[i, k] += 0.5 * (here @ mixed) / (size[i, 0] * size[k, 0])
-                hessian[k, i] = hessian[i, k]
-        units = scale[inside]
-        scaled = np.linalg.pinv(hessian * np.outer(units, units), hermitian=True)
-        steps[:, inside] = jacobian.T @ (scaled * np.outer(units, units))
-        return steps
+    none = np.zeros(place.size)
+    spread = jacobian(answer, none, none + _STEP)
+    squares = spread @ spread.T
+    if place.size < fit.free.size:
+        # A single point does not determine three values.
+        squares[:-2, :-2] = math.nan
+    return squares[:-2, :-2], (math.sqrt(squares[-2, -2]), math.sqrt(squares[-1, -1]))

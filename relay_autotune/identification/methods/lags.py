@@ -1,32 +1,36 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Models 1 to 5 of Chang, Shen and Yu 1992, and the exact oscillation of their lags.
+"""Models of lags and dead time from the period and the amplitude of a relay test.
 
-Static gain and height of the square wave are 1, so that y here is y/(K h). With T half a period,
-x = T/tau and m the part of a half period since the square wave went up, the output of one lag is
+Models 1 to 3 of Chang, Shen and Yu 1992 have n equal lags, model 4 two lags, model 5 two equal
+lags and one. Whatever the model, two equations hold in the limit cycle of an unbiased relay with
+the hysteresis epsilon, and the gain K and the time constants follow from them:
 
-    f(m, x) = 1 - 2 exp(-m x)/(1 + exp(-x)).
+    y = epsilon at the switch,  with y from a half period before on, after the dead time D,
+    max y = a.
 
-That of lags x_1 ... x_n in a row is the value at 0 of the polynomial through the points
-(x_i, f(m, x_i)). Newton's form of it equals the partial fractions (Chang, Shen and Yu 1992,
-appendix), but stays accurate where lags are equal or nearly so. For n equal lags it is
+With all harmonics and epsilon = 0 the first is eq 8, 9, 10 (n = 1, 2, 3), 11 or 12; with epsilon
+it has epsilon/(K h) for zero on its right-hand side. By the first harmonic the second is eq 21 to
+25, of which eq 23 has the exponent 3/2 (printed: 2/3), and the first the phase of eqs 7 and 13,
 
-    F_n = sum over k < n of (-x)^k/k! d^k f/dx^k.
+    w D + sum of atan(w tau_i) = pi - asin(epsilon/a),   w = 2 pi/P.
+
+Which harmonics count is told by a `Wave`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from scipy.optimize import brentq
 
-from relay_autotune.arrays import FloatArray
-from relay_autotune.errors import IdentificationError, ModelError
+from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods.square_wave import EXACT, FIRST, Wave
+from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.process.structures import (
     FOPDT,
     LAG_N,
@@ -36,193 +40,67 @@ from relay_autotune.process.structures import (
     equal_lags,
 )
 
-_CLOSE = 0.25
-_TAYLOR = 15
-_GRID = 64
-
-
-def level(time_constants: Sequence[float], period: float, part: float) -> float:
-    """Return y/(K h) at a part m of the half period in which the square wave is up.
-
-    :param time_constants: equal ones, two, or three of which the first two are equal [s].
-    :param period: P [s].
-    :param part: m, from 0 to 1.
-    :raises ModelError: if the time constants are of another pattern.
-    """
-    x = _ratios(time_constants, period)
-    value, factor = 0.0, 1.0
-    for ratio, difference in zip(x, _differences(part, x), strict=True):
-        value += factor * difference
-        factor *= -ratio
-    return value
-
-
-def slope_sign(time_constants: Sequence[float], period: float, part: float) -> float:
-    """Return a number with the sign of dy/dt at a part m of the upper half period.
-
-    :param time_constants: as for :func:`level` [s].
-    :param period: P [s].
-    :param part: m, from 0 to 1.
-    """
-    x = _ratios(time_constants, period)
-    if len(x) == 1:
-        return 1.0
-    # The rate is the highest difference times the product of -x.
-    return (-1.0) ** len(x) * _differences(part, x)[-1]
-
-
-def peak_part(time_constants: Sequence[float], period: float) -> float:
-    """Return when the measurement peaks: the part of a half period after the command arrived.
-
-    A square wave through real lags has one maximum in each period and one minimum half a period
-    later, so that there is one of the two. In the limit cycle of a relay it is a minimum.
-
-    :param time_constants: as for :func:`level` [s].
-    :param period: P [s].
-    """
-    x = _ratios(time_constants, period)
-    # Beyond this the effect of the half period before is below rounding.
-    if len(x) == 1 or min(x) > 50.0 + 5.0 * len(x):
-        return 0.0
-    # The amplitude there is flat, so that this accuracy gives it to the last digit.
-    return float(
-        brentq(lambda m: slope_sign(time_constants, period, m), 0.0, 1.0, xtol=1e-12, rtol=1e-9)
-    )
-
-
-def peak(time_constants: Sequence[float], period: float, harmonics: int | None = None) -> float:
-    """Return the amplitude y/(K h): the maximum over t of eq 19 of Chang et al.
-
-    The sum of eq 19 starts at n = 0 (printed: n = 1), and the root in its denominators covers
-    all factors.
-
-    :param time_constants: as for :func:`level`; with ``harmonics`` any real ones [s].
-    :param period: P [s].
-    :param harmonics: terms of the sum; 1: the describing function (eq 20); None: all of them.
-    """
-    if harmonics is None:
-        part = peak_part(time_constants, period)
-        if part == 0.0 and len(time_constants) > 1:
-            return 1.0
-        return abs(level(time_constants, period, part))
-    if harmonics == 1:
-        return fundamental(time_constants, period)
-    # One maximum in each half period, though ripples of the cut sum may lie on it.
-    angle = np.linspace(0.0, math.pi, _GRID * harmonics, endpoint=False)
-    y = _harmonic_sum(time_constants, period, harmonics, angle)
-    top = float(angle[np.argmax(np.abs(y))])
-    fine = top + np.linspace(-1.0, 1.0, 201) * math.pi / (_GRID * harmonics)
-    a = np.abs(_harmonic_sum(time_constants, period, harmonics, fine))
-    i = min(max(int(np.argmax(a)), 1), 199)
-    # The vertex of the parabola through the three highest points.
-    bend = a[i - 1] - 2.0 * a[i] + a[i + 1]
-    return float(a[i] - (a[i + 1] - a[i - 1]) ** 2 / (8.0 * bend)) if bend < 0.0 else float(a[i])
-
-
-def fundamental(time_constants: Sequence[float], period: float) -> float:
-    """Return the amplitude of the first harmonic, 4/pi |G(j w)|/K (eq 20).
-
-    :param time_constants: any real ones [s].
-    :param period: P [s].
-    """
-    w = 2.0 * math.pi / period
-    return 4.0 / math.pi / math.prod(math.hypot(1.0, w * tau) for tau in time_constants)
-
-
-def _harmonic_sum(
-    time_constants: Sequence[float], period: float, harmonics: int, angle: FloatArray
-) -> FloatArray:
-    w = 2.0 * math.pi / period
-    y = np.zeros_like(angle)
-    for n in range(harmonics):
-        k = 2 * n + 1
-        size = k * math.prod(math.hypot(1.0, k * w * tau) for tau in time_constants)
-        lag = sum(math.atan(k * w * tau) for tau in time_constants)
-        y += np.sin(k * angle - lag) / size
-    return 4.0 / math.pi * y
-
-
-def _ratios(time_constants: Sequence[float], period: float) -> tuple[float, ...]:
-    half = 0.5 * period
-    return tuple(half / tau for tau in time_constants)
-
-
-def _differences(m: float, x: tuple[float, ...]) -> list[float]:
-    """Divided differences f[x1], f[x1, x2], ..."""
-    if all(ratio == x[0] for ratio in x):
-        return _taylor(m, x[0], len(x))
-    if len(x) == 2:
-        return [_taylor(m, x[0], 1)[0], _secant(m, x[0], x[1])]
-    if len(x) != 3 or x[0] != x[1]:
-        raise ModelError(
-            f"found {len(x)} lags; expected equal ones, two, or three of which the first two are "
-            "equal"
-        )
-    step = x[2] - x[0]
-    if abs(step) < _CLOSE:
-        c = _taylor(m, x[0], _TAYLOR)
-        third = sum(c[k] * step ** (k - 2) for k in range(2, _TAYLOR))
-    else:
-        c = _taylor(m, x[0], 2)
-        third = (_secant(m, x[0], x[2]) - c[1]) / step
-    return [c[0], c[1], third]
-
-
-def _taylor(m: float, x: float, count: int) -> list[float]:
-    """First coefficients of f(m, x + d) in powers of d, from the quotient of two series."""
-    e = math.exp(-x)
-    # In a form without cancellation where x is small.
-    found = [(math.expm1(-x) - 2.0 * math.expm1(-m * x)) / (1.0 + e)]
-    if count == 1:
-        return found
-    above, below = math.exp(-m * x), [1.0 + e]
-    quotient = [above / below[0]]
-    for k in range(1, count):
-        above *= -m / k
-        e /= -k
-        below.append(e)
-        rest = above - sum(below[j] * quotient[k - j] for j in range(1, k + 1))
-        quotient.append(rest / below[0])
-        found.append(-2.0 * quotient[-1])
-    return found
-
-
-def _secant(m: float, x1: float, x2: float) -> float:
-    """Divided difference (f(x2) - f(x1))/(x2 - x1), without cancellation."""
-    x1, x2 = min(x1, x2), max(x1, x2)
-    d = x2 - x1
-    rise = math.expm1(-m * d) - math.exp(-x1 - m * d) * math.expm1(-(1.0 - m) * d)
-    scale = math.exp(-m * x1) / ((1.0 + math.exp(-x1)) * (1.0 + math.exp(-x2)))
-    return -2.0 * scale * rise / d
-
-
 MODEL_1, MODEL_4, MODEL_5 = FOPDT, SOPDT, TWO_EQUAL_ONE
 
-# Their names in messages.
-_TEXTS = {FOPDT: "one lag", SOPDT: "two lags", TWO_EQUAL_ONE: "two equal lags and one"}
+_STEP = 1.1
+_LONGEST = 1e10
+_NEARLY_ONE = 1.0 - 1e-12
+_WITH_LAG = 1.0 - 1e-6
+_NONE = 1e-12
+
+
+@dataclass(frozen=True)
+class _TwoConstants:
+    """Models between two orders of equal lags, by the share of a lag in the attenuation.
+
+    :param text: the model.
+    :param shares: from the parameter s to the share of each lag.
+    :param ends: of the branches of s, each of which holds one solution at most.
+    :param constants: places of the model's constants among the lags.
+    :param most: what has more lag than any such model.
+    :param instead: models with more lag.
+    """
+
+    text: str
+    shares: Callable[[float], tuple[float, ...]]
+    ends: tuple[float, ...]
+    constants: tuple[int, int]
+    most: str
+    instead: str
+
+
+# Between two equal lags and three there are two solutions, one with the larger constant repeated
+# and one with the smaller. Two equal lags are the end of the second branch, where the single one
+# vanishes.
+_TWO_CONSTANTS = {
+    MODEL_4: _TwoConstants(
+        *("model 4 (two lags)", lambda s: (1.0 - s, s), (_NONE, 0.5), (0, 1)),
+        *("two equal lags have", "model 3 or 5"),
+    ),
+    MODEL_5: _TwoConstants(
+        "model 5 (two equal lags and one)",
+        lambda s: (s, s, max(1.0 - 2.0 * s, 1e-13)),
+        *((_NONE, 1.0 / 3.0, 0.5), (1, 2), "three equal lags have", "more equal lags"),
+    ),
+}
 
 
 def model_text(model: Structure) -> str:
     """Return the name of a model, with the paper's number where it has one."""
-    numbers = {MODEL_1: 1, MODEL_4: 4, MODEL_5: 5}
-    number = numbers.get(model, model.order if model.order in (2, 3) else 0)
-    text = _TEXTS.get(model, f"{model.order} equal lags")
-    return f"model {number} ({text})" if number else text
+    if model in _TWO_CONSTANTS:
+        return _TWO_CONSTANTS[model].text
+    text = "one lag" if model.order == 1 else f"{model.order} equal lags"
+    return f"model {model.order} ({text})" if model.order <= 3 else text
 
 
-def require_equal_lags(model: Structure) -> None:
-    """Refuse a model whose gain is not known, but for equal lags.
-
-    :raises IdentificationError: if the model has two time constants.
-    """
-    if not model.equal_lags:
-        raise IdentificationError(
-            f"{model_text(model)} needs the gain of the process: its two time constants take "
-            "both the period and the amplitude; give the gain, or use the method li"
-        )
+def constants_text(constants: Sequence[float]) -> str:
+    """Return time constants as text."""
+    if len(constants) == 1:
+        return f"tau = {constants[0]:.4g} s"
+    return ", ".join(f"tau{i} = {c:.4g} s" for i, c in enumerate(constants, 1))
 
 
-def lags_of(model: Structure, constants: tuple[float, ...]) -> tuple[float, ...]:
+def lags_of(model: Structure, constants: Sequence[float]) -> tuple[float, ...]:
     """Return the time constants of all lags [s].
 
     :param model: one of the models.
@@ -234,38 +112,6 @@ def lags_of(model: Structure, constants: tuple[float, ...]) -> tuple[float, ...]
     )
 
 
-@dataclass(frozen=True)
-class Solution:
-    """A model's numbers.
-
-    :param gain: K > 0 [y/u].
-    :param constants: tau, or tau1 and tau2 [s].
-    :param others: the constants of other solutions [s].
-    """
-
-    gain: float
-    constants: tuple[float, ...]
-    others: tuple[tuple[float, ...], ...] = ()
-
-    def values(self, sign: int, dead_time: float) -> FloatArray:
-        """Return the values of the model's parameters.
-
-        :param sign: of the gain.
-        :param dead_time: of the process [s].
-        """
-        return np.array((sign * self.gain, *self.constants, dead_time))
-
-    def __str__(self) -> str:
-        return constants_text(self.constants)
-
-
-def constants_text(constants: tuple[float, ...]) -> str:
-    """Return time constants as text."""
-    if len(constants) == 1:
-        return f"tau = {constants[0]:.4g} s"
-    return ", ".join(f"tau{i} = {c:.4g} s" for i, c in enumerate(constants, 1))
-
-
 def model_asked_for(method: str, known: Known) -> Structure | None:
     """Return the model that is known, or None where the choice is the method's.
 
@@ -274,23 +120,202 @@ def model_asked_for(method: str, known: Known) -> Structure | None:
     :raises IdentificationError: if the method has no such model.
     """
     models = {model.name: model for model in (MODEL_1, MODEL_4, MODEL_5)}
-    if known.structure in models:
-        model = models[known.structure]
-        if known.order not in (0, model.order):
-            raise IdentificationError(
-                f"the structure {known.structure} has {model.order} lags, but the order given is "
-                f"{known.order}: leave one of the two out"
-            )
-        return model
-    if known.structure not in ("", LAG_N.name):
+    model = models.get(known.structure)
+    if model is not None and known.order not in (0, model.order):
+        raise IdentificationError(
+            f"the structure {known.structure} has {model.order} lags, but the order given is "
+            f"{known.order}: leave one of the two out"
+        )
+    if model is None and known.structure not in ("", LAG_N.name):
         raise IdentificationError(
             f"{method} has no structure {known.structure!r}; it has fopdt, lag_n, sopdt and "
             "two_equal_one"
         )
-    if known.order:
-        return equal_lags(known.order)
-    if known.structure:
+    if known.structure == LAG_N.name and not known.order:
         raise IdentificationError(
             "the structure lag_n needs its order, the number of equal lags: give it"
         )
-    return None
+    return model or (equal_lags(known.order) if known.order else None)
+
+
+def solutions(
+    model: Structure, cycle: SymmetricCycle, gain: float = math.nan, wave: Wave = EXACT
+) -> list[tuple[float, ...]]:
+    """Return (K, time constants ...) of the processes of a model that have a limit cycle.
+
+    :param model: n equal lags, which take the first equation alone where the gain is known;
+        model 4 or 5, which take both.
+    :param cycle: the limit cycle.
+    :param gain: K > 0 [y/u]; NaN: to be found, for equal lags.
+    :param wave: which harmonics count.
+    :return: two for model 5 between two equal lags and three, which period and amplitude do not
+        tell apart, that with the larger single constant first; one otherwise.
+    :raises IdentificationError: if there is none, or models 4 or 5 lack the gain.
+    """
+    if model.equal_lags:
+        return [equal(model.order, cycle, gain, wave)]
+    if math.isnan(gain):
+        raise IdentificationError(
+            f"{model_text(model)} needs the gain of the process: its two time constants take "
+            "both the period and the amplitude; give the gain, or use the method li"
+        )
+    _require_possible(cycle, gain)
+    row, relative = _TWO_CONSTANTS[model], cycle.amplitude / (gain * cycle.relay)
+
+    def lags(*shares: float) -> tuple[float, ...]:
+        return with_amplitude(shares, cycle.period, relative, wave)
+
+    def excess(share: float) -> float:
+        return above(lags(*row.shares(share)))
+
+    def above(time_constants: tuple[float, ...]) -> float:
+        height = wave.level(time_constants, cycle.period, cycle.part)
+        return height - cycle.level / (gain * cycle.relay)
+
+    low, middle, *more = row.ends
+    too_little = above(lags(1.0)) <= 0.0
+    if too_little or excess(middle) > 0.0:
+        what, instead = (
+            ("less lag than one lag has", "model 1")
+            if too_little
+            else (f"more lag than {row.most}", row.instead)
+        )
+        raise IdentificationError(
+            f"no process of {row.text} has this period and amplitude: it has {what} at this gain "
+            f"and dead time; try {instead}, or check gain and dead time"
+        )
+    roots = [_root(excess, low, middle)]
+    roots += [_root(excess, middle, high) for high in more if excess(high) > 0.0]
+    found = [lags(*row.shares(root)) for root in roots]
+    return [(gain, *(each[i] for i in row.constants)) for each in found]
+
+
+def equal(
+    order: int,
+    cycle: SymmetricCycle,
+    gain: float = math.nan,
+    wave: Wave = EXACT,
+    ratio: float = 0.0,
+) -> tuple[float, float]:
+    """Return (K, tau) of n equal lags.
+
+    An ideal relay's period does not depend on the gain: tau from the first equation, then K from
+    the second. With a hysteresis the two are one, level = (epsilon/a) peak. The smallest of
+    several roots is the limit cycle that a relay starts, if y rises there. Eq 8 also has the
+    trivial root tau = infinity, which is excluded.
+
+    :param order: n >= 1.
+    :param cycle: the limit cycle.
+    :param gain: K > 0, of which the second equation is not asked then [y/u]; NaN: to be found.
+    :param wave: which harmonics count.
+    :param ratio: the dead time is that of the cycle and ``ratio tau``.
+    :raises IdentificationError: if no such process has this limit cycle; for n = 1 and all
+        harmonics (1 - epsilon/a) P/4 < D < P/2 is needed.
+    """
+    _require_possible(cycle, gain)
+    period, unknown = cycle.period, math.isnan(gain)
+    share = cycle.level / cycle.amplitude
+    least = 0.25 * (1.0 - share) if unknown else 0.25 if cycle.level == 0.0 else -1.0
+    if order == 1 and wave is not FIRST and not cycle.dead_time > least * period:
+        raise IdentificationError(
+            f"no stable FOPDT process with a dead time of {cycle.dead_time:g} s oscillates with a "
+            f"period of {period:g} s; the dead time would lie between {least * period:g} s and "
+            f"{0.5 * period:g} s: the process has more than one lag, or is unstable, or the dead "
+            "time is misread"
+        )
+
+    if order < 3 and not (cycle.dead_time or ratio or cycle.level):
+        raise IdentificationError(
+            f"{order} lags without dead time do not oscillate under an ideal relay; at least 3 do"
+        )
+
+    def part(tau: float) -> float:
+        return cycle.part - 2.0 * ratio * tau / period
+
+    def excess(tau: float) -> float:
+        lags = (tau,) * order
+        at_switch = cycle.level / (gain * cycle.relay)
+        if unknown:
+            at_switch = share * wave.peak(lags, period) if share else 0.0
+        return wave.level(lags, period, part(tau)) - at_switch
+
+    longest = min(_LONGEST * period, 0.5 * period * cycle.part / ratio if ratio else math.inf)
+    tau, found = 0.5 * period * cycle.part / (3.0 * order + 60.0), math.nan
+    while tau * _STEP < longest:
+        before, tau, was, found = tau, tau * _STEP, found, excess(tau * _STEP)
+        if found <= 0.0 and (excess(before) if math.isnan(was) else was) > 0.0:
+            root = _root(excess, before, tau)
+            if wave.slope_sign((root,) * order, period, part(root)) > 0.0:
+                relative = wave.peak((root,) * order, period)
+                return (cycle.amplitude / (cycle.relay * relative) if unknown else gain), root
+    raise IdentificationError(
+        f"no process of {order} equal lags with a dead time of {cycle.dead_time:g} s "
+        + (f"and {ratio:g} tau " if ratio else "")
+        + f"oscillates with a period of {period:g} s under this relay: the dead time is misread, "
+        "or the process is of another structure"
+    )
+
+
+def with_amplitude(
+    shares: Sequence[float], period: float, relative_amplitude: float, wave: Wave = EXACT
+) -> tuple[float, ...]:
+    """Return the time constants that have an amplitude (eqs 21 to 25, by the first harmonic).
+
+    The eqs in one: 4 K h/(pi a_1) = prod(1 + (w tau_i)^2)^(1/2), where factor i is the attenuation
+    to the power ``shares[i]``. With all harmonics a_1 differs from a by a ratio that depends on
+    the time constants; solving for it gives the limit of the paper's iteration.
+
+    :param shares: of each lag in the logarithm of the attenuation, their sum 1.
+    :param period: P [s].
+    :param relative_amplitude: a/(K h).
+    :param wave: which harmonics count.
+    :raises IdentificationError: if the amplitude is too large for a process of this gain.
+    """
+    if not relative_amplitude < wave.largest:
+        raise IdentificationError(
+            f"an amplitude of {relative_amplitude:g} K h is more than the {wave.largest:g} that "
+            "lags of this gain can have: the gain given is too small, or the relay's amplitude "
+            "is wrong"
+        )
+    whole = math.log(4.0 / (math.pi * relative_amplitude))
+
+    def lags(attenuation: float) -> tuple[float, ...]:
+        w = 2.0 * math.pi / period
+        return tuple(math.sqrt(math.expm1(2.0 * s * attenuation)) / w for s in shares)
+
+    if wave is not EXACT:
+        return lags(whole)
+
+    def excess(attenuation: float) -> float:
+        return math.log(wave.peak(lags(attenuation), period) / relative_amplitude)
+
+    # The first harmonic of a square wave is 4/pi of it, that of a triangle 8/pi^2.
+    return lags(_root(excess, max(whole - 0.3, 1e-13), max(whole, 0.0) + 0.3))
+
+
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    at_low, at_high = function(low), function(high)
+    if at_low * at_high > 0.0:
+        # At the very end of the range of solutions, rounding may put the root outside.
+        return low if abs(at_low) < abs(at_high) else high
+    return float(brentq(function, low, high, xtol=1e-300, rtol=1e-15))
+
+
+def _require_possible(cycle: SymmetricCycle, gain: float) -> None:
+    """Refuse numbers of no limit cycle.
+
+    :param cycle: the limit cycle.
+    :param gain: K > 0 [y/u]; NaN: not known.
+    """
+    if not 0.0 <= cycle.dead_time < 0.5 * cycle.period * _WITH_LAG:
+        raise IdentificationError(
+            f"a dead time of {cycle.dead_time:g} s cannot be: a switch takes effect only after "
+            f"it, so that it is less than half the period, {0.5 * cycle.period:g} s"
+        )
+    if math.isnan(gain):
+        cycle.require_switching()
+    elif not cycle.level < _NEARLY_ONE * gain * cycle.relay:
+        raise IdentificationError(
+            f"a hysteresis of {cycle.level / (gain * cycle.relay):g} K h cannot be: below 1 the "
+            "relay would never have switched; the gain or the amplitude of the relay is wrong"
+        )

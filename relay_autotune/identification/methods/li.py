@@ -23,25 +23,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.estimate import Estimate, exact_steps, jacobian
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.methods.chang import gain_and_time_constant
+from relay_autotune.identification.methods.fit import Fit
 from relay_autotune.identification.methods.lags import (
     MODEL_1,
     MODEL_4,
     MODEL_5,
-    Solution,
+    constants_text,
+    equal,
     lags_of,
-    level,
     model_asked_for,
     model_text,
-    peak,
 )
+from relay_autotune.identification.methods.square_wave import level, peak
 from relay_autotune.identification.methods.symmetric_method import alike, shape_misfit
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.identification.shown.limit_cycle import (
@@ -57,33 +56,44 @@ from relay_autotune.identification.shown.limit_cycle import (
 from relay_autotune.process.structures import Structure, equal_lags
 from relay_autotune.record.record import Record
 
+METHOD = "li"
 # Relative errors of a period and an amplitude read off a chart.
 CHART_ERRORS = (0.002, 0.01)
+# Largest misfit that is agreement, in assumed errors.
+AGREEMENT = 2.0
 
 _DEAD_TIMES = (0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98)
-_STARTS = 3
 _SPREAD = 3.0
 _PENALTY = 1e3
 _TINY = 1e-30
-_MOST_STEPS = 60
 _LEAST_APART = 1e-3
+# Least relative errors of averages over cycles, whatever their scatter: a sampled relay's limit
+# cycle is not quite that of an ideal one.
+_LEAST_PERIOD_ERROR = 2e-4
+_LEAST_AMPLITUDE_ERROR = 1e-3
+_SHARE_OF_INTERVAL = 0.3
+_RAISED = 0.5
 
 
 @dataclass(frozen=True)
 class JointFit:
     """A model fitted to several tests.
 
-    :param solution: gain > 0 and time constants.
-    :param dead_time: of the process [s].
+    :param model: its structure.
+    :param values: of its parameters, shape (p,).
     :param misfit: root mean square of the residuals, in units of the errors assumed.
-    :param jacobian: derivatives of the residuals by gain, time constants and dead time, shape
-        (2 m, p).
+    :param covariance: of the values; zero for those that were not fitted, shape (p, p).
     """
 
-    solution: Solution
-    dead_time: float
+    model: Structure
+    values: FloatArray
     misfit: float
-    jacobian: FloatArray
+    covariance: FloatArray
+
+    @property
+    def solution(self) -> tuple[float, ...]:
+        """Size of the gain, and time constants."""
+        return abs(float(self.values[0])), *self.values[1:-1].tolist()
 
 
 def describing_function_point(cycle: SymmetricCycle) -> tuple[float, complex]:
@@ -92,13 +102,10 @@ def describing_function_point(cycle: SymmetricCycle) -> tuple[float, complex]:
     :param cycle: a limit cycle whose ``dead_time`` is what was added to the relay.
     :raises IdentificationError: if the hysteresis is not below the amplitude.
     """
-    if not cycle.hysteresis < cycle.amplitude:
-        raise IdentificationError(
-            f"an amplitude of {cycle.amplitude:g} is not above the hysteresis of "
-            f"{cycle.hysteresis:g}, so that the relay cannot have switched: check the numbers"
-        )
+    cycle = replace(cycle, switch_level=math.nan)
+    cycle.require_switching()
     size = math.pi * cycle.amplitude / (4.0 * cycle.relay)
-    turn = cycle.frequency * cycle.dead_time + math.asin(cycle.hysteresis / cycle.amplitude)
+    turn = cycle.frequency * cycle.dead_time + math.asin(cycle.level / cycle.amplitude)
     return cycle.frequency, -size * cmath.exp(1j * turn)
 
 
@@ -109,6 +116,7 @@ def fit_jointly(
     *,
     exact: bool = True,
     errors: Sequence[tuple[float, float]] = (),
+    sign: int = 1,
 ) -> JointFit:
     """Fit a model to the limit cycles of several tests.
 
@@ -118,12 +126,12 @@ def fit_jointly(
     :param exact: False: to the points of the describing function.
     :param errors: relative errors of the period and the amplitude of each test, which weight
         them; default: ``CHART_ERRORS``.
+    :param sign: of the gain.
     :raises IdentificationError: if the tests do not differ, or no such model comes near them.
     """
     require_difference(tests)
     errors = errors or (CHART_ERRORS,) * len(tests)
     longest = 0.999 * min(0.5 * t.period - t.dead_time for t in tests)
-    fitted = math.isnan(dead_time)
     if not longest > 0.0:
         raise IdentificationError(
             "the dead time added is more than half the period of its test, in which a switch "
@@ -134,52 +142,30 @@ def fit_jointly(
             f"a dead time of {dead_time:g} s, beside the one added, leaves less than half a "
             f"period for a switch to take effect: it must be below {longest:g} s"
         )
-    residuals = _exact_residuals if exact else _point_residuals
+    measure = _of_cycle if exact else _of_point
 
-    def unpacked(theta: FloatArray) -> tuple[float, tuple[float, ...], float]:
-        if not fitted:
-            return math.exp(theta[0]), tuple(np.exp(theta[1:]).tolist()), dead_time
-        delay = longest / (1.0 + math.exp(-theta[-1]))
-        return math.exp(theta[0]), tuple(np.exp(theta[1:-1]).tolist()), delay
+    def residual(values: FloatArray) -> FloatArray:
+        pairs = zip(tests, errors, strict=True)
+        return np.array([r for test, error in pairs for r in measure(model, values, test, error)])
 
-    def misfit(theta: FloatArray) -> FloatArray:
-        gain, constants, delay = unpacked(np.clip(theta, -80.0, 80.0))
-        return residuals(model, gain, constants, delay, tests, errors)
-
-    starts = _starts(model, tests, longest, dead_time)
-    ranked = sorted(starts, key=lambda s: float(np.sum(misfit(s) ** 2)))
-    best = None
-    for start in ranked[:_STARTS]:
-        found = least_squares(
-            misfit, start, xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=_MOST_STEPS
-        )
-        if best is None or found.cost < best.cost:
-            best = found
-        if best.cost < 1e-20:
-            break
-    if best is None:
+    given = np.full(len(model.names), math.nan)
+    given[-1] = dead_time
+    unit = 1.0 / max(test.frequency for test in tests)
+    fit = Fit(model, given, sign, residual, unit, longest)
+    starts = list(_starts(model, tests, longest, dead_time))
+    if not starts:
         raise IdentificationError(
             f"{model_text(model)} has no such limit cycles at any dead time: the process is of "
             "another structure, or the numbers are wrong"
         )
-    gain, constants, delay = unpacked(best.x)
-    if model == MODEL_4:
-        constants = tuple(sorted(constants, reverse=True))
-    values = np.array((gain, *constants, delay))
-
-    def of_values(v: FloatArray) -> FloatArray:
-        return residuals(model, v[0], tuple(v[1:-1].tolist()), v[-1], tests, errors)
-
-    sizes = 1e-5 * np.where(values == 0.0, values[1], values)
-    derivatives = jacobian(of_values, values, *exact_steps(values, sizes, 0.0))
-    if not fitted:
-        derivatives[:, -1] = 0.0
-    return JointFit(
-        Solution(gain, constants),
-        delay,
-        math.sqrt(2.0 * best.cost / (2 * len(tests))),
-        derivatives,
-    )
+    cost, x = fit.best(starts)
+    values = fit.values(x)
+    if model == MODEL_4 and values[1] < values[2]:
+        values[1:3] = values[2], values[1]
+    misfit = math.sqrt(cost / (2 * len(tests)))
+    # A misfit above 1 shows that the assumed errors were too small.
+    covariance = fit.covariance(fit.searched(values)) * max(misfit, 1.0) ** 2
+    return JointFit(model, values, misfit, covariance)
 
 
 def fits_jointly(
@@ -187,32 +173,26 @@ def fits_jointly(
     dead_time: float = math.nan,
     *,
     errors: Sequence[tuple[float, float]] = (),
-) -> list[tuple[Structure, JointFit]]:
+    sign: int = 1,
+) -> list[JointFit]:
     """Fit models 1 to 5, and return those that agree with all tests, the simplest first.
 
     If none does, the one that comes nearest.
 
-    :param tests: as for :func:`fit_jointly`.
-    :param dead_time: of the process [s]; NaN: fitted.
-    :param errors: as for :func:`fit_jointly`.
+    :param tests: as for :func:`fit_jointly`, as are the others.
     :raises IdentificationError: if no model can be fitted.
     """
-    fits: list[tuple[Structure, JointFit]] = []
-    refusal: IdentificationError | None = None
+    fits: list[JointFit] = []
+    refusals: list[IdentificationError] = []
     for model in (MODEL_1, equal_lags(2), equal_lags(3), MODEL_4, MODEL_5):
         try:
-            fits.append((model, fit_jointly(model, tests, dead_time, errors=errors)))
+            fits.append(fit_jointly(model, tests, dead_time, errors=errors, sign=sign))
         except IdentificationError as error:
-            refusal = refusal or error
+            refusals.append(error)
     if not fits:
-        assert refusal is not None
-        raise refusal
-    agreeing = [f for f in fits if f[1].misfit <= AGREEMENT]
-    return agreeing or [min(fits, key=lambda f: f[1].misfit)]
-
-
-# Largest misfit that is agreement, in assumed errors.
-AGREEMENT = 2.0
+        raise refusals[0]
+    agreeing = [fit for fit in fits if fit.misfit <= AGREEMENT]
+    return agreeing or [min(fits, key=lambda fit: fit.misfit)]
 
 
 def require_difference(tests: Sequence[SymmetricCycle]) -> None:
@@ -235,95 +215,56 @@ def require_difference(tests: Sequence[SymmetricCycle]) -> None:
         )
 
 
-def _exact_residuals(
-    model: Structure,
-    gain: float,
-    constants: tuple[float, ...],
-    dead_time: float,
-    tests: Sequence[SymmetricCycle],
-    errors: Sequence[tuple[float, float]],
-) -> FloatArray:
-    """Return how far periods and amplitudes are from the model's, to first order."""
+def _of_cycle(
+    model: Structure, values: FloatArray, test: SymmetricCycle, errors: tuple[float, float]
+) -> tuple[float, float]:
+    """Return how far period and amplitude are from the model's, to first order."""
+    gain, *constants, dead_time = np.abs(values).tolist()
     lags = lags_of(model, constants)
-    found = []
-    for test, (period_error, amplitude_error) in zip(tests, errors, strict=True):
 
-        def excess(period: float, test: SymmetricCycle = test) -> float:
-            part = 1.0 - 2.0 * (dead_time + test.dead_time) / period
-            return level(lags, period, max(part, 0.0)) - test.level / (gain * test.relay)
+    def excess(period: float) -> float:
+        part = 1.0 - 2.0 * (dead_time + test.dead_time) / period
+        return level(lags, period, max(part, 0.0)) - test.level / (gain * test.relay)
 
-        # The level at the switch grows with the period that is given to a model.
-        step = 1e-4
-        rise = (excess(test.period * (1 + step)) - excess(test.period * (1 - step))) / (2 * step)
-        missed = excess(test.period) / max(rise, 1e-9)
-        found.append(min(max(missed / period_error, -_PENALTY), _PENALTY))
-        # The response of extremely long lags is below rounding.
-        amplitude = max(gain * test.relay * peak(lags, test.period), _TINY * test.amplitude)
-        found.append(math.log(amplitude / test.amplitude) / amplitude_error)
-    return np.array(found)
+    # The level at the switch grows with the period that is given to a model.
+    step = 1e-4
+    rise = (excess(test.period * (1 + step)) - excess(test.period * (1 - step))) / (2 * step)
+    missed = excess(test.period) / max(rise, 1e-9) / errors[0]
+    # The response of extremely long lags is below rounding.
+    amplitude = max(gain * test.relay * peak(lags, test.period), _TINY * test.amplitude)
+    return (
+        min(max(missed, -_PENALTY), _PENALTY),
+        math.log(amplitude / test.amplitude) / errors[1],
+    )
 
 
-def _point_residuals(
-    model: Structure,
-    gain: float,
-    constants: tuple[float, ...],
-    dead_time: float,
-    tests: Sequence[SymmetricCycle],
-    errors: Sequence[tuple[float, float]],
-) -> FloatArray:
-    """Return how far the logarithms of G are from the describing function's points."""
-    found = []
-    for test, (_, amplitude_error) in zip(tests, errors, strict=True):
-        w, point = describing_function_point(test)
-        size, phase = gain, -w * dead_time
-        for tau in lags_of(model, constants):
-            size /= math.hypot(1.0, w * tau)
-            phase -= math.atan(w * tau)
-        wanted = -math.pi + math.remainder(cmath.phase(-point), 2.0 * math.pi)
-        found.append(math.log(size / abs(point)) / amplitude_error)
-        found.append((phase - wanted) / amplitude_error)
-    return np.array(found)
+def _of_point(
+    model: Structure, values: FloatArray, test: SymmetricCycle, errors: tuple[float, float]
+) -> tuple[float, float]:
+    """Return how far the logarithm of G is from that of the describing function's point."""
+    w, point = describing_function_point(test)
+    away = cmath.log(abs(values[0]) / values[0] * complex(model.build(values)(1j * w)) / point)
+    return away.real / errors[1], away.imag / errors[1]
 
 
 def _starts(
     model: Structure, tests: Sequence[SymmetricCycle], longest: float, dead_time: float
 ) -> list[FloatArray]:
-    """Return points to begin from: each agrees with one test, for equal lags."""
-    shares = _DEAD_TIMES if math.isnan(dead_time) else (math.nan,)
+    """Return values to begin from: each agrees with one test, for equal lags."""
+    delays = [dead_time] if dead_time >= 0.0 else [share * longest for share in _DEAD_TIMES]
     starts = []
-    for share in shares:
-        delay = dead_time if math.isnan(share) else share * longest
+    for delay in delays:
         for test in tests:
             try:
-                gain, tau = gain_and_time_constant(
-                    model.order,
-                    test.period,
-                    test.amplitude,
-                    delay + test.dead_time,
-                    test.relay,
-                    test.level,
-                )
+                cycle = replace(test, dead_time=delay + test.dead_time)
+                gain, tau = equal(model.order, cycle)
             except IdentificationError:
                 continue
-            tail = [] if math.isnan(share) else [math.log(share / (1.0 - share))]
-            log_tau = math.log(tau)
-            if model.equal_lags:
-                starts.append(np.array([math.log(gain), log_tau, *tail]))
-                continue
-            for spread in (_SPREAD, 1.0 / _SPREAD):
-                pair = [log_tau + math.log(spread), log_tau - math.log(spread)]
-                starts.append(np.array([math.log(gain), *pair, *tail]))
+            spreads = (1.0,) if model.equal_lags else (_SPREAD, 1.0 / _SPREAD)
+            for spread in spreads:
+                constants = (tau,) if model.equal_lags else (tau * spread, tau / spread)
+                starts.append(np.array((gain, *constants, delay)))
     return starts
-
-
-METHOD = "li"
-
-# Least relative errors of averages over cycles, whatever their scatter: a sampled relay's limit
-# cycle is not quite that of an ideal one.
-_LEAST_PERIOD_ERROR = 2e-4
-_LEAST_AMPLITUDE_ERROR = 1e-3
-_SHARE_OF_INTERVAL = 0.3
-_RAISED = 0.5
 
 
 def identify_li(record: Record, known: Known = NOTHING) -> Identification:
@@ -356,17 +297,22 @@ def identify_li_jointly(records: Sequence[Record], known: Known = NOTHING) -> Id
         )
     cycles = [CycleReader.of(test.whole).read(test.whole, 0.0) for test in tests]
     require_difference(cycles)
-    errors = [_errors(test) for test in tests]
-    candidates = _fits(cycles, known, errors)
-    away = [_shape_misfit(tests, cycles, *candidate) for candidate in candidates]
-    model, fit = next(c for c, a in zip(candidates, away, strict=True) if alike(a, min(away)))
-    values = fit.solution.values(-1 if settings[0].reverse_acting else 1, fit.dead_time)
+    sign = -1 if settings[0].reverse_acting else 1
+    candidates = _fits(cycles, known, [_errors(test) for test in tests], sign)
+    away = [_shape_misfit(tests, cycles, candidate) for candidate in candidates]
+    fit = next(c for c, a in zip(candidates, away, strict=True) if alike(a, min(away)))
     degrees = sum(len(test.singles) - 1 for test in tests)
+    remarks = [
+        f"test {number}: {remark}"
+        for number, test in enumerate(tests, start=1)
+        for remark in (skew_warning(test.whole), "" if test.whole.cycle.converged else NOT_SETTLED)
+        if remark
+    ]
     return identified(
         METHOD,
-        Estimate.of(model, values, _covariance(fit) if degrees > 0 else None),
+        Estimate.of(fit.model, fit.values, fit.covariance if degrees > 0 else None),
         float(stdtrit(max(degrees, 1), 0.975)),
-        warnings=(*_warnings(tests), *_remarks(model, cycles, known, fit)),
+        warnings=(*remarks, *_remarks(cycles, known, fit)),
     )
 
 
@@ -378,91 +324,70 @@ def li_from_numbers(cycles: Sequence[SymmetricCycle], known: Known) -> Identific
     :param known: dead time, structure and order where they are known.
     :raises IdentificationError: if they do not differ, or no model agrees with them.
     """
-    model, fit = _fits(cycles, known, ())[0]
-    return identified(
-        METHOD,
-        Estimate.of(model, fit.solution.values(1, fit.dead_time)),
-        warnings=tuple(_remarks(model, cycles, known, fit)),
-    )
+    fit = _fits(cycles, known, (), 1)[0]
+    estimate = Estimate.of(fit.model, fit.values)
+    return identified(METHOD, estimate, warnings=tuple(_remarks(cycles, known, fit)))
 
 
 def _fits(
-    cycles: Sequence[SymmetricCycle], known: Known, errors: Sequence[tuple[float, float]]
-) -> list[tuple[Structure, JointFit]]:
+    cycles: Sequence[SymmetricCycle],
+    known: Known,
+    errors: Sequence[tuple[float, float]],
+    sign: int,
+) -> list[JointFit]:
     model = model_asked_for(METHOD, known)
     if model is None:
-        return fits_jointly(cycles, known.dead_time, errors=errors)
-    return [(model, fit_jointly(model, cycles, known.dead_time, errors=errors))]
+        return fits_jointly(cycles, known.dead_time, errors=errors, sign=sign)
+    return [fit_jointly(model, cycles, known.dead_time, errors=errors, sign=sign)]
 
 
 def _shape_misfit(
-    tests: Sequence[RelayTest], cycles: Sequence[SymmetricCycle], model: Structure, fit: JointFit
+    tests: Sequence[RelayTest], cycles: Sequence[SymmetricCycle], fit: JointFit
 ) -> float:
     """Return how far the half cycles of all tests are from a model's, over their amplitudes."""
-    squares = 0.0
+    away = []
     for test, cycle in zip(tests, cycles, strict=True):
-        delayed = replace(cycle, dead_time=fit.dead_time + cycle.dead_time)
-        away = shape_misfit(test.whole, model, delayed, fit.solution)
-        squares += (away / cycle.amplitude) ** 2
-    return math.sqrt(squares)
+        delayed = replace(cycle, dead_time=float(fit.values[-1]) + cycle.dead_time)
+        misfit = shape_misfit(test.whole, fit.model, delayed, fit.solution)
+        away.append(misfit / cycle.amplitude)
+    return math.hypot(*away)
 
 
 def _errors(test: RelayTest) -> tuple[float, float]:
-    """Relative errors of the averaged period and amplitude."""
+    """Return relative errors of the averaged period and amplitude."""
     whole = test.whole
     values = features(whole)
-    interval = whole.record.interval
     covariance, _ = test.scatter(features)
     spread = np.zeros(2) if covariance is None else np.sqrt(np.diag(covariance))
     period, amplitude = (spread / values).tolist()
     # Noise makes every peak higher, which the scatter does not show.
     noise = whole.record.noise_std
     raised = _RAISED * noise / float(values[1]) if math.isfinite(noise) else 0.0
+    sampled = _SHARE_OF_INTERVAL * whole.record.interval / float(values[0])
     return (
-        max(period, _SHARE_OF_INTERVAL * interval / float(values[0]), _LEAST_PERIOD_ERROR),
+        max(period, sampled, _LEAST_PERIOD_ERROR),
         max(amplitude, raised, _LEAST_AMPLITUDE_ERROR),
     )
 
 
-def _covariance(fit: JointFit) -> FloatArray:
-    """Return the covariance of the values; zero for those that were not fitted."""
-    size = np.linalg.norm(fit.jacobian, axis=0)
-    fitted = size > 0.0
-    scaled = fit.jacobian[:, fitted] / size[fitted]
-    covariance = np.zeros((size.size, size.size))
-    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-14, hermitian=True)
-    covariance[np.ix_(fitted, fitted)] = inverse / np.outer(size[fitted], size[fitted])
-    # A misfit above 1 shows that the assumed errors were too small.
-    return covariance * max(fit.misfit, 1.0) ** 2
-
-
-def _warnings(tests: Sequence[RelayTest]) -> list[str]:
-    found = []
-    for number, test in enumerate(tests, start=1):
-        remarks = [skew_warning(test.whole), "" if test.whole.cycle.converged else NOT_SETTLED]
-        found += [f"test {number}: {remark}" for remark in remarks if remark]
-    return found
-
-
-def _remarks(
-    model: Structure, cycles: Sequence[SymmetricCycle], known: Known, fit: JointFit
-) -> list[str]:
+def _remarks(cycles: Sequence[SymmetricCycle], known: Known, fit: JointFit) -> list[str]:
     """Return how well the tests agree, and what the paper's describing function gives."""
     found = []
     if not math.isnan(known.gain):
         found.append("the gain given was not used: li finds it from the tests")
     if fit.misfit > AGREEMENT:
         found.append(
-            f"the tests do not agree with {model_text(model)}: periods and amplitudes miss it by "
-            f"{fit.misfit:.2g} times their errors; the process is of another structure, or "
+            f"the tests do not agree with {model_text(fit.model)}: periods and amplitudes miss it "
+            f"by {fit.misfit:.2g} times their errors; the process is of another structure, or "
             "changed between the tests"
         )
     try:
-        literal = fit_jointly(model, cycles, known.dead_time, exact=False)
+        literal = fit_jointly(fit.model, cycles, known.dead_time, exact=False)
     except IdentificationError:
         return found
+    gain, *constants, dead_time = literal.values.tolist()
     found.append(
-        f"by the describing function, as in the paper, the tests would give K = "
-        f"{literal.solution.gain:.4g}, {literal.solution}, dead time {literal.dead_time:.4g} s"
+        f"by the describing function, as in the paper, the tests would give K = {gain:.4g}, "
+        f"{constants_text(constants)}, dead time {dead_time:.4g} s"
     )
     return found

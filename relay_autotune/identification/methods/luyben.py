@@ -29,7 +29,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.estimate import Estimate, jacobian
+from relay_autotune.identification.estimate import Estimate, carried
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.result import FitReport, Identification, identified
 from relay_autotune.process.response import response
@@ -38,40 +38,6 @@ from relay_autotune.record.record import PiecewiseConstant, Record
 
 _SMALL = 1e-3
 _LARGEST = 1e8
-
-
-def step_response(
-    time: FloatArray, gain: float, tau1: float, tau2: float, step: float
-) -> FloatArray:
-    """Return the response to a step (eq 2) [y].
-
-    :param time: since the end of the dead time, >= 0 [s], shape (n,).
-    :param gain: K [y/(u s)].
-    :param tau1: of the inverse response [s].
-    :param tau2: of the lag [s].
-    :param step: du [u].
-    """
-    ramp = time - (tau1 + tau2) * -np.expm1(-time / tau2)
-    return np.asarray(step * gain * ramp)
-
-
-def step_features(
-    gain: float, tau1: float, tau2: float, step: float
-) -> tuple[float, float, float]:
-    """Return time t1 and height of the extremum, and the return to zero t2 (eqs 4 to 6).
-
-    :param gain: K [y/(u s)].
-    :param tau1: > 0 [s].
-    :param tau2: > 0 [s].
-    :param step: du [u].
-    :return: t1 [s], t2 [s], y_ext [y].
-    """
-    r = 1.0 + tau1 / tau2
-    t1 = tau2 * math.log1p(tau1 / tau2)
-    # z/(1 - exp(-z)) exceeds both 1 + z/2 and z.
-    low, high = r - 1.0, min(2.0 * (r - 1.0), r)
-    z = float(brentq(lambda z: _r_less_1(z) - (r - 1.0), low, high, xtol=1e-300, rtol=1e-15))
-    return t1, tau2 * z, step * gain * (t1 - tau1)
 
 
 def from_step(t1: float, t2: float, extremum: float, step: float) -> tuple[float, float, float]:
@@ -145,7 +111,6 @@ _BEYOND = 1.4
 _SIGNIFICANT = 4.0
 _NEGLIGIBLE = 1e-9
 _UNEXPLAINED = 1.5
-_STEP = 1e-6
 
 
 @dataclass(frozen=True)
@@ -199,8 +164,14 @@ def identify_step(record: Record, known: Known = NOTHING) -> Identification:
     curve, covariance = _fitted(test, until, known.dead_time)
     values = _values(curve, test.step)
     if covariance is not None:
-        slopes = _jacobian(curve, test.step)
-        covariance = slopes @ covariance @ slopes.T
+        end = curve.dead_time + curve.span
+
+        def of_curve(x: FloatArray) -> FloatArray:
+            dead_time = float(x[0])
+            return _values(StepCurve(dead_time, end - dead_time, x[1:]), test.step)
+
+        at = np.concatenate(([curve.dead_time], curve.coefficients))
+        covariance = carried(of_curve, at, covariance)
     fit, fitted = _report(record, test, curve, values)
     warnings = []
     noise = _noise(test, record.noise_std)
@@ -431,22 +402,6 @@ def _real_roots(polynomial: np.polynomial.Chebyshev, span: float) -> FloatArray:
     roots = polynomial.roots()
     real = roots.real[np.abs(roots.imag) < 1e-9 * span]
     return np.sort(real[(real > 1e-9 * span) & (real <= span)])
-
-
-def _jacobian(curve: StepCurve, step: float) -> FloatArray:
-    """Return the derivatives of the values by dead time, coefficients and baseline."""
-    end = curve.dead_time + curve.span
-
-    def values(x: FloatArray) -> FloatArray:
-        dead_time = float(x[0])
-        # A derivative by a coefficient keeps the span; one by the dead time keeps the end.
-        span = curve.span if dead_time == curve.dead_time else end - dead_time
-        return _values(StepCurve(dead_time, span, x[1:]), step)
-
-    at = np.concatenate(([curve.dead_time], curve.coefficients))
-    steps = np.full(at.size, _STEP * float(np.abs(curve.coefficients[:-1]).max()))
-    steps[0] = _STEP * curve.span
-    return jacobian(values, at, steps)
 
 
 def _report(

@@ -1,11 +1,12 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the methods for an unbiased relay have share: dead time, choice of a model, uncertainty.
+"""The methods for an unbiased relay that find lags: the choice of a model, and its uncertainty.
 
-If the gain is known, period and amplitude each give a time constant of models 1 to 3; their
-difference shows whether the structure is right. The simplest model that fits is used (Luyben 1987,
-Chang, Shen and Yu 1992).
+Period, amplitude, level at the switch and dead time are what the test tells; the equations of
+:mod:`~relay_autotune.identification.methods.lags` make a model of them. If the gain is known,
+period and amplitude each give a time constant of models 1 to 3; their difference shows whether the
+structure is right. The simplest model that fits is used (Luyben 1987, Chang, Shen and Yu 1992).
 """
 
 from __future__ import annotations
@@ -18,29 +19,28 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.experiment.settling import ResponseDetector, RestState
-from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.estimate import Estimate, carried
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods.lags import (
     MODEL_1,
     MODEL_4,
     MODEL_5,
-    Solution,
     constants_text,
+    equal,
     lags_of,
-    level,
     model_asked_for,
     model_text,
+    solutions,
+    with_amplitude,
 )
+from relay_autotune.identification.methods.square_wave import EXACT, Wave, level
 from relay_autotune.identification.result import Identification, identified
-from relay_autotune.identification.shown.fold import Fold, fold
+from relay_autotune.identification.shown.dead_time import DeadTime, read_dead_time
 from relay_autotune.identification.shown.limit_cycle import (
     NOT_SETTLED,
     CycleReader,
     CycleRun,
-    RelayTest,
     SymmetricCycle,
-    features,
     half_cycles,
     known_gain,
     relay_test,
@@ -48,142 +48,18 @@ from relay_autotune.identification.shown.limit_cycle import (
     skew_warning,
 )
 from relay_autotune.process.structures import Structure, equal_lags
-from relay_autotune.record.record import Record, RelaySettings
+from relay_autotune.quantities import NORMAL_95
+from relay_autotune.record.record import Record
 
-# Least jump of the rate at a sharp edge, relative to its largest value: that of one lag jumps by
-# more than 1 where the command arrives.
-_JUMP = 0.6
-_BESIDE = 0.01
-_MOST_SINGLES = 8
-
-
-@dataclass(frozen=True)
-class DeadTime:
-    """Where the dead time of the process comes from.
-
-    :param value: s.
-    :param std: standard deviation of what was read [s]; 0: it was given.
-    :param source: a sentence for the user; empty: it was given.
-    """
-
-    value: float
-    std: float = 0.0
-    source: str = ""
-
-
-def read_dead_time(test: RelayTest, record: Record, known: Known, *, noisy: bool) -> DeadTime:
-    """Return the dead time that is known, or read it from the record.
-
-    One lag turns at once when the command arrives, so that the measurement has an edge there in
-    each half cycle. If the averaged half cycles have one, its time is taken, otherwise the time
-    from the first kick to the first sample outside the noise.
-
-    :param test: the relay test.
-    :param record: the whole record, with the samples before the kick.
-    :param known: a known dead time.
-    :param noisy: True if noise matters.
-    :raises IdentificationError: if it is not known and the record does not show it.
-    """
-    if not math.isnan(known.dead_time):
-        return DeadTime(known.dead_time)
-    settings = test.whole.settings
-    edge, sharp = _edge(test.whole)
-    if sharp:
-        value = max(edge - settings.extra_delay, 0.0)
-        source = (
-            f"the dead time of {value:.4g} s was read as the time from the switch to the sharp "
-            "peak; give it where it is known better, since these equations are sensitive to it"
-        )
-        return DeadTime(value, _scatter_of_edge(test, noisy), source)
-    first, interval = _first_response(record, settings)
-    if math.isnan(first):
-        raise IdentificationError(
-            "the dead time is not known, and neither sharp peaks nor a first kick from rest show "
-            "it in the record: give the dead time, or use the method waveform"
-        )
-    value = max(first - settings.extra_delay, 0.0)
-    source = (
-        f"the dead time of {value:.4g} s was read from the first response to the kick, which a "
-        "slow beginning or noise delays; give it where it is known better"
-    )
-    return DeadTime(value, interval / math.sqrt(12.0), source)
-
-
-def _edge(stretch: CycleRun) -> tuple[float, bool]:
-    """Return the time from a switch to the edge after it, and whether it is sharp."""
-    try:
-        curve = fold(stretch.record, tuple(range(len(stretch.record.cycle_start) - 1)))
-    except IdentificationError:
-        return math.nan, False
-    if math.isnan(curve.edge):
-        return math.nan, False
-    return curve.edge, _is_sharp(curve)
-
-
-def _is_sharp(curve: Fold) -> bool:
-    beside = _BESIDE * 0.5 * curve.period
-    before, after = curve.slope(np.array((curve.edge - beside, curve.edge + beside)))
-    # Away from the edges, where a spline in noise has its largest rates.
-    steepest = np.abs(curve.slope(np.linspace(0.0, curve.period, 101)))
-    return bool(abs(after - before) > _JUMP * float(np.percentile(steepest, 90.0)))
-
-
-def _scatter_of_edge(test: RelayTest, noisy: bool) -> float:
-    """Return the standard deviation of the edge [s].
-
-    In noise it is the scatter of single cycles; without, the edge is between two samples.
-    """
-    if not noisy:
-        return test.whole.record.interval / math.sqrt(12.0 * len(test.whole.cycle.cycles))
-    stride = -(-len(test.singles) // _MOST_SINGLES)
-    edges = np.array([_edge(single)[0] for single in test.singles[::stride]])
-    edges = edges[np.isfinite(edges)]
-    if edges.size < 2:
-        return 0.0
-    return float(np.std(edges, ddof=1)) / math.sqrt(len(test.whole.cycle.cycles))
-
-
-def _first_response(record: Record, settings: RelaySettings) -> tuple[float, float]:
-    """Return the time from the first kick to the response, and the interval in which it began.
-
-    NaN: there was no kick from rest.
-    """
-    u = record.input()
-    resting = abs(u.initial - settings.baseline) < 0.5 * settings.amplitude
-    if u.times.size == 0 or not resting or u.times[0] < record.time[0]:
-        return math.nan, math.nan
-    kick = float(u.times[0])
-    before = record.measurement[record.time <= kick]
-    noise = record.noise_std
-    if math.isnan(noise):
-        noise = float(np.std(before)) if before.size >= 10 else 0.0
-    # Without noise, rounding remains.
-    floor = 1e-9 * float(np.ptp(record.measurement))
-    rest = RestState(
-        mean=float(np.mean(before)),
-        slope=0.0,
-        noise_std=max(noise, floor),
-        span=float(kick - record.time[0]),
-        samples=before.size,
-        range_seen=float(np.ptp(before)),
-    )
-    detector = ResponseDetector(rest, kick)
-    after = slice(int(np.searchsorted(record.time, kick, side="right")), None)
-    for time, y in zip(record.time[after], record.measurement[after], strict=True):
-        if detector.add(float(time), float(y)):
-            seen = 0.5 * (detector.last_inside + detector.first_outside) - kick
-            return seen, detector.first_outside - detector.last_inside
-    return math.nan, math.nan
-
-
-MOST_EQUAL = 20
-
+_MOST_EQUAL = 20
 # Ratio of two misfits of the half cycles up to which structures are equally good, and the misfit
 # that sampling causes, as a share of the amplitude.
 _ALIKE = 1.02
 _ALIKE_SHARE = 3e-3
 _SHAPE_SAMPLES = 300
-_SMALL = 0.1
+
+# Gain and time constants.
+Solution = tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -191,115 +67,167 @@ class SymmetricMethod:
     """A method that finds one of models 1 to 5 from a symmetric limit cycle.
 
     :param name: its name in the registry.
-    :param solve: from model, limit cycle and gain (> 0; NaN: not known) to the numbers.
-    :param mismatch: from order, limit cycle and gain to log(tau by the period/tau by the
-        amplitude) of equal lags. Zero: the structure fits. Positive: the process has more lag;
-        infinite: no time constant gives the period. Negative: it has less lag.
+    :param wave: which harmonics count in its equations; without :data:`EXACT` the hysteresis that
+        is told counts, not the level at which the relay was seen to switch.
     :param agreement: largest mismatch that counts as zero where its scatter is not known.
     :param remarks: from model, limit cycle and gain to sentences for the user.
     """
 
     name: str
-    solve: Callable[[Structure, SymmetricCycle, float], Solution]
-    mismatch: Callable[[int, SymmetricCycle, float], float]
+    wave: Wave
     agreement: float
     remarks: Callable[[Structure, SymmetricCycle, float], list[str]]
 
+    def solve(self, model: Structure, cycle: SymmetricCycle, gain: float) -> list[Solution]:
+        """Return the solutions of a model.
+
+        Equal lags with a known gain have an equation too many: exactly their time constant is
+        that of the period; by the describing function it is the mean of both.
+
+        :param model: which one.
+        :param cycle: the limit cycle.
+        :param gain: K > 0 [y/u]; NaN: not known.
+        :raises IdentificationError: if there is none, or models 4 or 5 lack the gain.
+        """
+        if self.wave is EXACT or not model.equal_lags or math.isnan(gain):
+            return solutions(model, cycle, gain, self.wave)
+        return [(gain, 0.5 * sum(self._both(model.order, cycle, gain)))]
+
+    def mismatch(self, order: int, cycle: SymmetricCycle, gain: float) -> float:
+        """Return log(tau by the period/tau by the amplitude) of n equal lags.
+
+        :param order: n >= 1.
+        :param cycle: the limit cycle.
+        :param gain: K > 0 [y/u].
+        :return: zero: the structure fits; positive: the process has more lag; infinite: no time
+            constant gives the period; negative: it has less lag.
+        :raises IdentificationError: if the gain is too small for the amplitude or the hysteresis,
+            or the dead time too large for the period.
+        """
+        try:
+            by_amplitude, by_period = self._both(order, cycle, gain)
+        except IdentificationError:
+            # Unless the numbers themselves cannot be.
+            self._by_amplitude(order, cycle, gain)
+            if cycle.part <= 0.0 or not cycle.level < min(gain * cycle.relay, cycle.amplitude):
+                raise
+            return math.inf
+        return math.log(by_period / by_amplitude)
+
+    def excess(self, order: int, cycle: SymmetricCycle, gain: float) -> float:
+        """Return y/(K h) at the switch minus what it should be, of n equal lags by the amplitude.
+
+        :param order: n >= 1, as for :meth:`mismatch`, whose sign it has.
+        """
+        lags = (self._by_amplitude(order, cycle, gain),) * order
+        height = self.wave.level(lags, cycle.period, max(cycle.part, 0.0))
+        return height - cycle.level / (gain * cycle.relay)
+
+    def _by_amplitude(self, order: int, cycle: SymmetricCycle, gain: float) -> float:
+        relative = cycle.amplitude / (gain * cycle.relay)
+        return with_amplitude((1.0 / order,) * order, cycle.period, relative, self.wave)[0]
+
+    def _both(self, order: int, cycle: SymmetricCycle, gain: float) -> tuple[float, float]:
+        """Return tau by the amplitude and by the period; the phase of the latter needs no gain."""
+        by_amplitude = self._by_amplitude(order, cycle, gain)
+        told = gain if self.wave is EXACT else math.nan
+        return by_amplitude, equal(order, cycle, told, self.wave)[1]
+
 
 @dataclass(frozen=True)
-class Found:
-    """An identification with the limit cycle that it was found from.
+class LimitCycle:
+    """What is known of a limit cycle.
 
-    :param identification: the model.
-    :param model: its structure.
-    :param cycle: the limit cycle.
-    :param period_std: standard deviation of its period [s]; NaN: not estimated.
-    :param amplitude_std: of its amplitude [y]; NaN: not estimated.
+    :param cycle: its numbers; the dead time includes what the relay added.
+    :param dead_time: of the process.
+    :param sign: of its gain.
+    :param covariance: of period, amplitude, level and dead time, shape (4, 4); None: not known.
+    :param quantile: half the width of a 95 % interval in standard deviations.
+    :param whole: the cycles in the record; None: there is none.
     """
 
-    identification: Identification
-    model: Structure
     cycle: SymmetricCycle
-    period_std: float = math.nan
-    amplitude_std: float = math.nan
+    dead_time: DeadTime
+    sign: int
+    covariance: FloatArray | None = None
+    quantile: float = NORMAL_95
+    whole: CycleRun | None = None
+
+    @property
+    def features(self) -> FloatArray:
+        """Period, amplitude, level at the switch and dead time."""
+        cycle = self.cycle
+        return np.array((cycle.period, cycle.amplitude, cycle.level, cycle.dead_time))
+
+    def at(self, features: FloatArray) -> SymmetricCycle:
+        """Return the limit cycle with other features."""
+        period, amplitude, height, dead_time = features.tolist()
+        return replace(
+            self.cycle,
+            period=period,
+            amplitude=amplitude,
+            # The scatter about zero is that of the reading, to both sides.
+            switch_level=min(height, 0.99 * amplitude),
+            dead_time=max(dead_time, 0.0),
+        )
+
+    def std(self, function: Callable[[SymmetricCycle], float]) -> float:
+        """Return the standard deviation of a number of the cycle; NaN: not known."""
+        if self.covariance is None:
+            return math.nan
+
+        def number(features: FloatArray) -> FloatArray:
+            return np.array([function(self.at(features))])
+
+        spread = carried(number, self.features, self.covariance)
+        return math.sqrt(spread[0, 0])
 
 
-def from_record(method: SymmetricMethod, record: Record, known: Known) -> Found:
-    """Identify one of models 1 to 5 from an unbiased relay test.
+def read_limit_cycle(method: SymmetricMethod, record: Record, known: Known) -> LimitCycle:
+    """Return the limit cycle of an unbiased relay test, with its scatter from cycle to cycle.
 
-    :param method: how.
+    :param method: for which method.
     :param record: a relay test without bias.
-    :param known: gain, dead time, structure and order where they are known.
-    :raises IdentificationError: if the relay was biased, or no such model has the limit cycle.
+    :param known: gain and dead time where they are known.
+    :raises IdentificationError: if the relay was biased, or the dead time cannot be read.
     """
     test = relay_test(method.name, record)
     whole = test.whole
     require_unbiased(method.name, whole.settings)
     sign = -1 if whole.settings.reverse_acting else 1
-    gain = known_gain(known, sign)
+    known_gain(known, sign)
     reader = CycleReader.of(whole)
     dead_time = read_dead_time(test, record, known, noisy=reader.noisy)
 
     def read(stretch: CycleRun) -> SymmetricCycle:
-        return reader.read(stretch, dead_time.value)
+        found = reader.read(stretch, dead_time.value)
+        return found if method.wave is EXACT else replace(found, switch_level=math.nan)
 
-    cycle = read(whole)
-    model, remark = _choice(method, test, read, gain, known)
-    solution = _by_shape(whole, model, cycle, method.solve(model, cycle, gain))
+    def features(stretch: CycleRun) -> FloatArray:
+        found = read(stretch)
+        height = reader.level(stretch) if method.wave is EXACT else found.level
+        return np.array((found.period, found.amplitude, height, 0.0))
 
-    def values(stretch: CycleRun) -> FloatArray:
-        single = _alike(method.solve(model, read(stretch), gain), solution)
-        return single.values(sign, dead_time.value)
-
-    def values_at(delay: float) -> FloatArray:
-        moved = replace(cycle, dead_time=delay + whole.settings.extra_delay)
-        return _alike(method.solve(model, moved, gain), solution).values(sign, delay)
-
-    covariance, quantile = test.scatter(values)
-    if covariance is not None and dead_time.std > 0.0:
-        covariance = covariance + _covariance_of(values_at, dead_time)
-    remarks = [
-        dead_time.source,
-        remark,
-        skew_warning(whole),
-        "" if whole.cycle.converged else NOT_SETTLED,
-        *_remarks(method, model, cycle, gain, solution),
-    ]
-    identification = identified(
-        method.name,
-        Estimate.of(model, solution.values(sign, dead_time.value), covariance),
-        quantile,
-        warnings=tuple(r for r in remarks if r),
-    )
-    spread, _ = test.scatter(features)
-    if spread is None:
-        return Found(identification, model, cycle)
-    period_std, amplitude_std = (float(s) for s in np.sqrt(np.diag(spread)))
-    return Found(identification, model, cycle, period_std, amplitude_std)
+    covariance, quantile = test.scatter(features)
+    if covariance is not None:
+        covariance[3, 3] = dead_time.std**2
+    return LimitCycle(read(whole), dead_time, sign, covariance, quantile, whole)
 
 
-def _covariance_of(values_at: Callable[[float], FloatArray], dead_time: DeadTime) -> FloatArray:
-    """Return the covariance that the uncertainty of a dead time that was read adds.
+def from_record(method: SymmetricMethod, record: Record, known: Known) -> Identification:
+    """Identify one of models 1 to 5 from an unbiased relay test.
 
-    :param values_at: from a dead time [s] to the values.
-    :param dead_time: as it was read.
+    :param method: how.
+    :param record: a relay test without bias.
+    :param known: gain, dead time, structure and order where they are known. Without the gain
+        only equal lags can be found; a dead time that is not known is read from the record;
+        without the structure the simplest model that fits is taken.
+    :raises IdentificationError: if the relay was biased, or no such model has the limit cycle.
     """
-    ends = []
-    for side in (-1.0, 1.0):
-        delay = max(dead_time.value + side * _SMALL * dead_time.std, 0.0)
-        try:
-            ends.append((delay, values_at(delay)))
-        except IdentificationError:
-            # At the end of the range of solutions a difference to one side is enough.
-            ends.append((dead_time.value, values_at(dead_time.value)))
-    (low, below), (high, above) = ends
-    if not high > low:
-        return np.full((below.size, below.size), math.nan)
-    rate = dead_time.std * (above - below) / (high - low)
-    return np.outer(rate, rate)
+    return from_cycle(method, read_limit_cycle(method, record, known), known)
 
 
-def from_numbers(method: SymmetricMethod, cycle: SymmetricCycle, known: Known) -> Found:
+def from_numbers(method: SymmetricMethod, cycle: SymmetricCycle, known: Known) -> Identification:
     """Identify one of models 1 to 5 from the numbers of a limit cycle.
 
     :param method: how.
@@ -308,130 +236,125 @@ def from_numbers(method: SymmetricMethod, cycle: SymmetricCycle, known: Known) -
     :raises IdentificationError: if no such model has the limit cycle.
     """
     sign = -1 if known.gain < 0.0 else 1
-    gain = abs(known.gain)
-    model, remark = model_asked_for(method.name, known), ""
-    if model is None and math.isnan(gain):
-        model, remark = _choose_without_gain(method, cycle, None)
-    elif model is None:
-        model, remark = choose(method, cycle, gain)
-    solution = method.solve(model, cycle, gain)
-    remarks = [remark, *_remarks(method, model, cycle, gain, solution)]
-    identification = identified(
-        method.name,
-        Estimate.of(model, solution.values(sign, cycle.dead_time)),
-        warnings=tuple(r for r in remarks if r),
-    )
-    return Found(identification, model, cycle)
+    return from_cycle(method, LimitCycle(cycle, DeadTime(cycle.dead_time), sign), known)
 
 
-def choose(
-    method: SymmetricMethod,
-    cycle: SymmetricCycle,
-    gain: float,
-    tolerance: Callable[[int], float] | None = None,
-) -> tuple[Structure, str]:
-    """Choose the simplest model that fits, where the gain is known.
+def from_cycle(method: SymmetricMethod, seen: LimitCycle, known: Known) -> Identification:
+    """Identify one of models 1 to 5 from a limit cycle, read or told.
 
-    :param method: whose mismatch counts.
-    :param cycle: the limit cycle.
-    :param gain: K > 0 [y/u].
-    :param tolerance: from the order of equal lags to the largest mismatch that counts as zero;
-        default: the method's agreement.
-    :return: the model, and a sentence where none fits well, else an empty one.
+    :param method: how.
+    :param seen: the limit cycle.
+    :param known: gain, structure and order where they are known.
+    :raises IdentificationError: if no such model has the limit cycle.
     """
+    gain, cycle, whole = abs(known.gain), seen.cycle, seen.whole
+    model, remark = model_asked_for(method.name, known), ""
+    if model is None:
+        choice = _choice_by_shape if math.isnan(gain) else _choice
+        model, remark = choice(method, seen, gain)
+    found = method.solve(model, cycle, gain)
+    if whole is not None:
+        found = sorted(found, key=lambda each: shape_misfit(whole, model, cycle, each))
+    taken, *others = found
+
+    def values(features: FloatArray) -> FloatArray:
+        candidates = method.solve(model, seen.at(features), gain)
+        nearest = min(candidates, key=lambda each: _distance(each, taken))
+        dead_time = seen.dead_time.value + features[3] - cycle.dead_time
+        return np.array((seen.sign * nearest[0], *nearest[1:], max(dead_time, 0.0)))
+
+    covariance = None
+    if seen.covariance is not None:
+        covariance = carried(values, seen.features, seen.covariance)
+    remarks = [seen.dead_time.source, remark]
+    if whole is not None:
+        remarks += [skew_warning(whole), "" if whole.cycle.converged else NOT_SETTLED]
+    if model.equal_lags and not math.isnan(gain):
+        remarks.append(_mismatch_text(method, model, cycle, gain))
+    remarks += [
+        f"{model_text(model)} has two solutions, which period and amplitude do not tell apart: "
+        f"{constants_text(taken[1:])} was taken, {constants_text(other[1:])} would do as well"
+        for other in others
+    ]
+    remarks += method.remarks(model, cycle, gain)
+    best = np.array((seen.sign * taken[0], *taken[1:], seen.dead_time.value))
+    estimate = Estimate.of(model, best, covariance)
+    warnings = tuple(r for r in remarks if r)
+    return identified(method.name, estimate, seen.quantile, warnings=warnings)
+
+
+def _distance(solution: Solution, other: Solution) -> float:
+    return sum(abs(math.log(a / b)) for a, b in zip(solution[1:], other[1:], strict=True))
+
+
+def _choice(method: SymmetricMethod, seen: LimitCycle, gain: float) -> tuple[Structure, str]:
+    """Choose the simplest model that fits, where the gain is known."""
     found: dict[int, float] = {}
 
     def fits(order: int) -> bool:
-        found[order] = method.mismatch(order, cycle, gain)
-        if not math.isfinite(found[order]):
-            return False
-        return abs(found[order]) <= (tolerance(order) if tolerance else method.agreement)
+        found[order] = method.mismatch(order, seen.cycle, gain)
+        return _agrees(method, seen, gain, order, found[order])
 
     # Between two orders of equal lags lies a model with one lag more that differs.
-    for order, between in ((1, None), (2, MODEL_4), (3, MODEL_5)):
+    for order, between in ((1, MODEL_1), (2, MODEL_4), (3, MODEL_5)):
         if fits(order):
             return equal_lags(order), ""
         if found[order] < 0.0:
-            return (MODEL_1 if between is None else between), ""
-    best = 3
-    for order in range(4, MOST_EQUAL + 1):
+            return between, ""
+    for order in range(4, _MOST_EQUAL + 1):
         if fits(order):
             return equal_lags(order), ""
-        if abs(found[order]) < abs(found[best]):
-            best = order
         if found[order] < 0.0:
             break
-    return equal_lags(best), ""
+    return equal_lags(min((n for n in found if n >= 3), key=lambda n: abs(found[n]))), ""
 
 
-def _choice(
-    method: SymmetricMethod,
-    test: RelayTest,
-    read: Callable[[CycleRun], SymmetricCycle],
-    gain: float,
-    known: Known,
-) -> tuple[Structure, str]:
-    cycle = read(test.whole)
-    asked = model_asked_for(method.name, known)
-    if asked is not None:
-        return asked, ""
-    if math.isnan(gain):
-        return _choose_without_gain(method, cycle, test.whole)
-    interval = test.whole.record.interval
+def _agrees(
+    method: SymmetricMethod, seen: LimitCycle, gain: float, order: int, mismatch: float
+) -> bool:
+    """Return whether period and amplitude agree on n equal lags, within what is uncertain.
 
-    def tolerance(order: int) -> float:
-        """Allow for the scatter of the cycles, and half a sample interval of dead time."""
+    That is the scatter of the cycles, and half a sample interval of dead time.
+    """
+    if abs(mismatch) <= method.agreement or seen.whole is None or math.isinf(mismatch):
+        return abs(mismatch) <= method.agreement
+    cycle, half = seen.cycle, 0.5 * seen.whole.record.interval
 
-        def value(stretch: CycleRun) -> FloatArray:
-            found = method.mismatch(order, read(stretch), gain)
-            if not math.isfinite(found):
-                raise IdentificationError("this cycle alone has no time constant")
-            return np.array([found])
+    def excess(at: SymmetricCycle, dead_time: float = cycle.dead_time) -> float:
+        return method.excess(order, replace(at, dead_time=max(dead_time, 0.0)), gain)
 
-        allowed = method.agreement
-        covariance, quantile = test.scatter(value)
-        if covariance is not None:
-            allowed = max(allowed, quantile * math.sqrt(covariance[0, 0]))
-        for shift in (-0.5, 0.5):
-            moved = replace(cycle, dead_time=max(cycle.dead_time + shift * interval, 0.0))
-            if moved.part > 0.0:
-                change = method.mismatch(order, moved, gain) - method.mismatch(order, cycle, gain)
-                allowed = max(allowed, abs(change))
-        return allowed
-
-    return choose(method, cycle, gain, tolerance)
+    here, scatter = excess(cycle), seen.std(excess)
+    shifts = [abs(excess(cycle, cycle.dead_time + side) - here) for side in (-half, half)]
+    return abs(here) <= max(0.0 if math.isnan(scatter) else seen.quantile * scatter, *shifts)
 
 
-def _choose_without_gain(
-    method: SymmetricMethod, cycle: SymmetricCycle, whole: CycleRun | None
+def _choice_by_shape(
+    method: SymmetricMethod, seen: LimitCycle, gain: float
 ) -> tuple[Structure, str]:
     """Choose among equal lags by the shape of the half cycles.
 
     Period and amplitude only give gain and time constant then.
-
-    :param whole: the cycles; None: nothing is known of their shape.
     """
-    solved: dict[int, Solution] = {}
+    cycle, whole = seen.cycle, seen.whole
     away: dict[int, float] = {}
-    for order in range(1, MOST_EQUAL + 1):
+    for order in range(1, _MOST_EQUAL + 1):
         if order > 3 and (
-            not solved or whole is None or min(away, key=away.__getitem__) < order - 1
+            whole is None or not away or min(away, key=away.__getitem__) < order - 1
         ):
             break
         try:
-            solved[order] = method.solve(equal_lags(order), cycle, math.nan)
+            (solution,) = method.solve(equal_lags(order), cycle, gain)
         except IdentificationError:
             continue
         away[order] = 0.0
         if whole is not None:
-            misfit = shape_misfit(whole, equal_lags(order), cycle, solved[order])
+            misfit = shape_misfit(whole, equal_lags(order), cycle, solution)
             away[order] = misfit / cycle.amplitude
-    if not solved:
+    if not away:
         # The error of the simplest model says what is wrong.
-        method.solve(MODEL_1, cycle, math.nan)
-    order = min(n for n in solved if alike(away[n], min(away.values())))
+        method.solve(MODEL_1, cycle, gain)
+    model = equal_lags(min(n for n in away if alike(away[n], min(away.values()))))
     why = "its simplicity" if whole is None else "the shape of its half cycles"
-    model = equal_lags(order)
     return model, (
         f"without the gain the structure is not checked: {model_text(model)} was taken for "
         f"{why}; give the gain or the structure where they are known"
@@ -453,39 +376,25 @@ def shape_misfit(
     """Return the root mean square of half cycles minus those of a solution [y]."""
     since, y = half_cycles(whole)
     stride = max(1, since.size // _SHAPE_SAMPLES)
-    lags = lags_of(model, solution.constants)
-    half = 0.5 * cycle.period
-    squares = 0.0
-    for time, seen in zip(since[::stride].tolist(), y[::stride].tolist(), strict=True):
+    gain, *constants = solution
+    lags, half = lags_of(model, constants), 0.5 * cycle.period
+
+    def modelled(time: float) -> float:
         # The command that turns the measurement down arrives after the dead time.
         before = time < cycle.dead_time
-        part = (time - cycle.dead_time) / half + before
-        height = level(lags, cycle.period, min(max(part, 0.0), 1.0))
-        squares += (seen - (height if before else -height) * solution.gain * cycle.relay) ** 2
-    return math.sqrt(squares / since[::stride].size)
+        part = min(max((time - cycle.dead_time) / half + before, 0.0), 1.0)
+        return (1.0 if before else -1.0) * level(lags, cycle.period, part)
+
+    shape = np.array([modelled(time) for time in since[::stride].tolist()])
+    return math.sqrt(float(np.mean((y[::stride] - gain * cycle.relay * shape) ** 2)))
 
 
-def _remarks(
-    method: SymmetricMethod,
-    model: Structure,
-    cycle: SymmetricCycle,
-    gain: float,
-    solution: Solution,
-) -> list[str]:
-    remarks = []
-    if model.equal_lags and not math.isnan(gain):
-        difference = method.mismatch(model.order, cycle, gain)
-        if abs(difference) > method.agreement:
-            remarks.append(_mismatch_text(model, difference))
-    remarks += [
-        f"{model_text(model)} has two solutions, which period and amplitude do not tell apart: "
-        f"{solution} was taken, {constants_text(other)} would do as well"
-        for other in solution.others
-    ]
-    return remarks + method.remarks(model, cycle, gain)
-
-
-def _mismatch_text(model: Structure, difference: float) -> str:
+def _mismatch_text(
+    method: SymmetricMethod, model: Structure, cycle: SymmetricCycle, gain: float
+) -> str:
+    difference = method.mismatch(model.order, cycle, gain)
+    if abs(difference) <= method.agreement:
+        return ""
     if math.isinf(difference):
         apart = "cannot agree: no time constant gives the period"
     else:
@@ -496,27 +405,3 @@ def _mismatch_text(model: Structure, difference: float) -> str:
         f"the two time constants of {model_text(model)} {apart}; the process is of another "
         "structure, or gain or dead time are not right"
     )
-
-
-def _by_shape(
-    whole: CycleRun, model: Structure, cycle: SymmetricCycle, solution: Solution
-) -> Solution:
-    """Put the solution first whose half cycles are most like the record's."""
-    if not solution.others:
-        return solution
-
-    def misfit(constants: tuple[float, ...]) -> float:
-        return shape_misfit(whole, model, cycle, Solution(solution.gain, constants))
-
-    first, *rest = sorted((solution.constants, *solution.others), key=misfit)
-    return Solution(solution.gain, first, tuple(rest))
-
-
-def _alike(solution: Solution, reference: Solution) -> Solution:
-    """Return the one of several solutions that is nearest to another."""
-
-    def away(constants: tuple[float, ...]) -> float:
-        pairs = zip(constants, reference.constants, strict=True)
-        return sum(abs(math.log(c / r)) for c, r in pairs)
-
-    return Solution(solution.gain, min((solution.constants, *solution.others), key=away))

@@ -1,63 +1,35 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-r"""Models of three structures from the shape of an unbiased relay test.
+r"""FOPDT models from the shape of an unbiased relay test, and the paper's correlations.
 
 Thyagarajan and Yu, "Improved Autotuning Using the Shape Factor from Relay Feedback", Ind. Eng.
 Chem. Res. 2003. t = 0 is where y rises through the level at which the relay switches; P is the
 period, a the amplitude, h that of the relay.
 
-Each set of equations is here twice. The literal one is for an ideal relay that switches at zero;
-its eqs 21 to 24, 26 and 27 use the first harmonic alone. The exact one is for a relay that
-switches at the level epsilon, with all harmonics. Corrected are eq 17, where the bracket divides,
-and eq 23, which the paper solved with 22/7 for pi.
+The literal equations are for an ideal relay that switches at zero; eqs 21 to 24, 26 and 27 use the
+first harmonic alone. The exact ones are for a relay that switches at the level epsilon, with all
+harmonics. Corrected are eq 17, where the bracket divides, and eq 23, which the paper solved with
+22/7 for pi. Those of equal lags (eqs 5, 23 and 24 for two with D = 0.001 tau; 6, 26
+and 27 for five without dead time) are `equal` of
+:mod:`~relay_autotune.identification.methods.lags`, literally with the first harmonic and a level
+of zero.
 """
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
 from scipy.optimize import brentq
 
-from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.methods.lags import level as level_of_lags
-from relay_autotune.identification.methods.lags import peak as peak_of_lags
+from relay_autotune.identification.methods.first_order import first_order
 
 SMALL_DEAD_TIME = 0.001
 HIGHER_ORDER = 5
 
 _NEARLY_ONE = 1.0 - 1e-14
 _INTEGRATING = 1e-9
-_STEP = 1.1
-_LONGEST = 1e10
-
-
-def first_half(
-    time: FloatArray,
-    gain: float,
-    time_constant: float,
-    dead_time: float,
-    relay: float,
-    level: float = 0.0,
-) -> FloatArray:
-    """Return y from one switch to the next (eqs 8 and 9; 14 and 15 for an unstable process).
-
-    With K h = g, y = g - (g - epsilon) exp(-t/tau) until the dead time has passed, and falls
-    towards -g from there. An unstable process is the same with negative K and tau.
-
-    :param time: since the switch, up to half a period [s], shape (n,).
-    :param gain: K of K exp(-D s)/(tau s + 1) [y/u].
-    :param time_constant: tau [s].
-    :param dead_time: D [s].
-    :param relay: h [u].
-    :param level: epsilon, where the relay switches; 0: as in the paper [y].
-    """
-    g = gain * relay
-    rising = g - (g - level) * np.exp(-time / time_constant)
-    late = np.maximum(time - dead_time, 0.0)
-    return np.asarray(rising + 2.0 * g * np.expm1(-late / time_constant))
 
 
 def fopdt(
@@ -84,7 +56,8 @@ def fopdt(
             f"{_earliest(period, amplitude, level):g} s: no stable FOPDT process does that (eq "
             "10); the process has more lags, integrates, or is unstable"
         )
-    return amplitude / (v * relay), 0.25 * period / math.atanh(v), time_to_peak
+    gain, tau, _ = first_order(math.atanh(v), period, amplitude, relay, level)
+    return gain, tau, time_to_peak
 
 
 def unstable_fopdt(
@@ -111,31 +84,8 @@ def unstable_fopdt(
             f"= {_earliest(period, amplitude, level):g} s: no unstable FOPDT process does that "
             "(eq 16)"
         )
-    return -amplitude / (v * relay), -0.25 * period / math.atanh(v), time_to_peak
-
-
-def unstable_limit_cycle(
-    gain: float, time_constant: float, dead_time: float, relay: float, level: float = 0.0
-) -> tuple[float, float]:
-    """Return (P, a) of an unstable FOPDT process (eqs 14 and 16, with a level).
-
-    :param gain: K > 0 of K exp(-D s)/(tau s - 1) [y/u].
-    :param time_constant: tau > 0 [s].
-    :param dead_time: D [s].
-    :param relay: h [u].
-    :param level: epsilon [y].
-    :raises IdentificationError: unless (1 + epsilon/(K h)) e^{D/tau} < 2; for an ideal relay,
-        unless D/tau < ln 2.
-    """
-    g, growth = gain * relay, math.exp(dead_time / time_constant)
-    amplitude = (level + g) * growth - g
-    if not amplitude < g:
-        raise IdentificationError(
-            f"no limit cycle: D/tau = {dead_time / time_constant:g} must be less than ln 2 - ln(1 "
-            f"+ epsilon/(K h)) = {math.log(2.0 / (1.0 + level / g)):g}, or the process escapes "
-            "before the relay's switch takes effect"
-        )
-    return 4.0 * time_constant * math.atanh(amplitude / g), amplitude
+    gain, tau, _ = first_order(math.atanh(v), period, amplitude, relay, level)
+    return -gain, -tau, time_to_peak
 
 
 def _earliest(period: float, amplitude: float, level: float) -> float:
@@ -166,16 +116,12 @@ def _reach(period: float, amplitude: float, time_to_peak: float, level: float) -
             return 0.5 * (1.0 - e) - share
         return (math.log1p(-e * v) - math.log1p(-v)) / (2.0 * math.atanh(v)) - share
 
-    if excess(_NEARLY_ONE) < 0.0:
-        raise IdentificationError(
-            f"a peak {time_to_peak:g} s after the switch is at the very end of the half period "
-            f"of {0.5 * period:g} s: the process has no lag that shows"
-        )
-    if excess(-_NEARLY_ONE) > 0.0:
-        raise IdentificationError(
-            f"a peak {time_to_peak:g} s after the switch is at the very beginning of the half "
-            f"period of {0.5 * period:g} s: no FOPDT process does that"
-        )
+    for place, side in (("end", 1.0), ("beginning", -1.0)):
+        if side * excess(side * _NEARLY_ONE) < 0.0:
+            raise IdentificationError(
+                f"a peak {time_to_peak:g} s after the switch is at the very {place} of the half "
+                f"period of {0.5 * period:g} s: no FOPDT process has a lag that shows there"
+            )
     return float(brentq(excess, -_NEARLY_ONE, _NEARLY_ONE, xtol=1e-16, rtol=1e-15))
 
 
@@ -228,116 +174,7 @@ def flat_fopdt(
         w, ultimate_gain = 2.0 * math.pi / period, 4.0 * relay / (math.pi * amplitude)
         dead_time = (math.pi - math.atan(tau * w)) / w
         return math.hypot(1.0, tau * w) / ultimate_gain, tau, dead_time
-    # K h - a and K h - epsilon without the difference of nearly equal numbers.
-    quarter = 0.25 * period / tau
-    g = amplitude / math.tanh(quarter)
-    left = amplitude * 2.0 / math.expm1(2.0 * quarter)
-    return g / relay, tau, tau * math.log((g - level) / left)
-
-
-def small_dead_time(
-    period: float,
-    amplitude: float,
-    relay: float,
-    ratio: float = SMALL_DEAD_TIME,
-    level: float | None = None,
-) -> tuple[float, float, float]:
-    """Return (K, tau, D) of K exp(-D s)/(tau s + 1)^2 with D = ratio tau (eqs 5, 23, 24).
-
-    :param period: P [s].
-    :param amplitude: a [y].
-    :param relay: h [u].
-    :param ratio: D/tau, the paper's epsilon.
-    :param level: where the relay switches [y]; None: eqs 23 and 24 literally, with exact pi.
-    :raises IdentificationError: if no such process has this limit cycle.
-    """
-    if level is not None:
-        return lags_from_cycle(2, period, amplitude, relay, level, ratio=ratio)
-    w = 2.0 * math.pi / period
-    x = float(
-        brentq(
-            lambda x: ratio * x + 2.0 * math.atan(x) - math.pi,
-            0.0,
-            math.pi / ratio,
-            xtol=1e-300,
-            rtol=1e-15,
-        )
-    )
-    return (1.0 + x * x) * math.pi * amplitude / (4.0 * relay), x / w, ratio * x / w
-
-
-def higher_order(
-    period: float,
-    amplitude: float,
-    relay: float,
-    order: int = HIGHER_ORDER,
-    level: float | None = None,
-) -> tuple[float, float]:
-    """Return (K, tau) of K/(tau s + 1)^n (eqs 6, 26, 27).
-
-    :param period: P [s].
-    :param amplitude: a [y].
-    :param relay: h [u].
-    :param order: n >= 3.
-    :param level: where the relay switches [y]; None: eqs 26 and 27 literally.
-    :raises IdentificationError: if the order is less than 3, or no such process has this limit
-        cycle.
-    """
-    if order < 3:
-        raise IdentificationError(
-            f"{order} lags without dead time do not oscillate under a relay; at least 3 do"
-        )
-    if level is not None:
-        return lags_from_cycle(order, period, amplitude, relay, level)[:2]
-    w, x = 2.0 * math.pi / period, math.tan(math.pi / order)
-    return math.hypot(1.0, x) ** order * math.pi * amplitude / (4.0 * relay), x / w
-
-
-def lags_from_cycle(
-    order: int,
-    period: float,
-    amplitude: float,
-    relay: float,
-    level: float,
-    *,
-    ratio: float = 0.0,
-    dead_time: float = 0.0,
-) -> tuple[float, float, float]:
-    """Return (K, tau, D) of n equal lags, from y = epsilon at the switch and y = a at the peak.
-
-    :param order: n.
-    :param period: P [s].
-    :param amplitude: a [y].
-    :param relay: h [u].
-    :param level: epsilon [y].
-    :param ratio: of D = ratio tau + dead_time.
-    :param dead_time: of the same sum [s].
-    :raises IdentificationError: if no such process has this limit cycle.
-    """
-    share = level / amplitude
-    if not abs(share) < 1.0:
-        raise IdentificationError(
-            f"an amplitude of {amplitude:g} does not exceed the switching level of {level:g}"
-        )
-
-    def excess(tau: float) -> float:
-        lags, part = (tau,) * order, 1.0 - 2.0 * (dead_time + ratio * tau) / period
-        return level_of_lags(lags, period, part) - share * peak_of_lags(lags, period)
-
-    # The limit cycle that a relay starts is that of the smallest tau, the lowest frequency.
-    longest = (0.5 * period - dead_time) / ratio if ratio else _LONGEST * period
-    before = tau = (0.5 * period - dead_time) / (3.0 * order + 60.0)
-    while 0.0 < tau * _STEP < longest:
-        before, tau = tau, tau * _STEP
-        if excess(tau) <= 0.0 < excess(before):
-            tau = float(brentq(excess, before, tau, xtol=1e-300, rtol=1e-15))
-            gain = amplitude / (relay * peak_of_lags((tau,) * order, period))
-            return gain, tau, dead_time + ratio * tau
-    raise IdentificationError(
-        f"no process of {order} equal lags with a dead time of {dead_time:g} s and {ratio:g} tau "
-        f"oscillates with a period of {period:g} s and an amplitude of {amplitude:g} when the "
-        f"relay switches at {level:g}"
-    )
+    return first_order(0.25 * period / tau, period, amplitude, relay, level)
 
 
 def dead_time_ratio(growth: float) -> float:

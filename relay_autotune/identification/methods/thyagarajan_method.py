@@ -19,23 +19,23 @@ from scipy.special import stdtrit
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.estimate import Estimate, jacobian
+from relay_autotune.identification.estimate import Estimate, carried
 from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.methods.lags import equal
+from relay_autotune.identification.methods.square_wave import FIRST
 from relay_autotune.identification.methods.thyagarajan2003 import (
     HIGHER_ORDER,
     SMALL_DEAD_TIME,
     dead_time_ratio,
     flat_fopdt,
     fopdt,
-    higher_order,
-    lags_from_cycle,
     order_from_curvature,
-    small_dead_time,
     unstable_fopdt,
 )
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.identification.shown.limit_cycle import (
     NOT_SETTLED,
+    SymmetricCycle,
     relay_test,
     require_unbiased,
     skew_warning,
@@ -57,36 +57,27 @@ from relay_autotune.record.record import Record
 METHOD = "thyagarajan"
 
 _TOO_LITTLE_DIFFERENCE = 1e-3
-_STEP = 1e-4
 _DEVIATIONS = 2.0
 _OTHER_RATIO = 0.01
 
 
 @dataclass(frozen=True)
-class Solver:
+class Row:
     """One structure with its equations, for a relay of amplitude 1 that turns a process upwards.
 
     :param name: the structure, as text.
     :param equations: their numbers in the paper.
     :param structure: of the model.
     :param solve: from shape and the level at which the relay switched to values, shape (p,);
-        level None: by the equations of the paper as they stand.
-    :param ideal: the level of the relay in the paper's equations; None: they have no place for it.
+        None: by the equations of the paper as they stand.
+    :param harmonic: whether these use the first harmonic.
     """
 
     name: str
     equations: str
     structure: Structure
-    solve: Callable[[Shape, float | None], FloatArray]
-    ideal: float | None = 0.0
-
-    def exact(self, shape: Shape) -> FloatArray:
-        """Return the values for the level at which the relay switched, shape (p,)."""
-        return self.solve(shape, shape.level)
-
-    def literal(self, shape: Shape) -> FloatArray:
-        """Return the values by the equations as they stand, shape (p,)."""
-        return self.solve(shape, self.ideal)
+    solve: Callable[[Shape, float | None], Sequence[float]]
+    harmonic: bool = False
 
 
 @dataclass(frozen=True)
@@ -131,22 +122,17 @@ def identify_thyagarajan(record: Record, known: Known = NOTHING) -> Identificati
     settings = test.whole.settings
     require_unbiased(METHOD, settings)
     reading = read_shape(record)
-    if known.structure in (FOPDT.name, UNSTABLE_FOPDT.name) and reading.shape.category in (
-        "2",
-        "3",
-    ):
+    one_lag = known.structure in (FOPDT.name, UNSTABLE_FOPDT.name)
+    if one_lag and reading.shape.category in ("2", "3"):
         # One lag has sharp peaks, though noise may hide them.
         reading = read_shape(record, sharp=True)
     extra = settings.extra_delay
-    seen = replace(known, dead_time=known.dead_time + extra)
-    solver, why = choose(reading, seen)
-    warnings = [why]
-    if not test.whole.cycle.converged:
-        warnings.append(NOT_SETTLED)
-    warnings += [w for w in (skew_warning(test.whole),) if w]
-    warnings += refinements(reading.shape, record)
+    shape = reading.shape
+    row, reading, why = choose(reading, replace(known, dead_time=known.dead_time + extra))
+    warnings = [why, "" if test.whole.cycle.converged else NOT_SETTLED, skew_warning(test.whole)]
+    warnings = [w for w in warnings if w] + refinements(shape, record)
     sign = -1.0 if settings.reverse_acting else 1.0
-    return _identified(solver, reading, settings.amplitude * sign, extra, warnings)
+    return _identified(row, reading, settings.amplitude * sign, extra, warnings)
 
 
 def identify_numbers(shape: Shape, relay: float, known: Known, categorised: str) -> Identification:
@@ -158,13 +144,14 @@ def identify_numbers(shape: Shape, relay: float, known: Known, categorised: str)
     :param categorised: category that is taken where no structure is known.
     :raises IdentificationError: if no such model has the limit cycle.
     """
-    reading = Reading(shape, (), None, 1)
-    solver, _ = choose(reading, known, categorised)
-    return _identified(solver, reading, relay, 0.0, [])
+    row, reading, _ = choose(Reading(shape, (), None, 1), known, categorised)
+    return _identified(row, reading, relay, 0.0, [])
 
 
-def choose(reading: Reading, known: Known, categorised: str = "") -> tuple[Solver, str]:
-    """Choose the structure, and return it with the reason.
+def choose(reading: Reading, known: Known, categorised: str = "") -> tuple[Row, Reading, str]:
+    """Choose the structure, and return it with the reading and the reason.
+
+    A dead time that is known takes the place of the time to the peak in the reading.
 
     :param reading: the shape.
     :param known: what is known, with the dead time as the relay saw it.
@@ -173,202 +160,170 @@ def choose(reading: Reading, known: Known, categorised: str = "") -> tuple[Solve
     """
     shape, dead_time = reading.shape, known.dead_time
     found = categorised or shape.category
-    if not math.isnan(dead_time):
-        shape = replace(shape, time_to_peak=dead_time)
     why = (
         f"the shape is of category {found} (q = {shape.sharpness:.2f}, tau_G/P = "
         f"{shape.growth:.2f}, plateau {shape.plateau:.2f} of the half period)"
     )
-    match known.structure:
-        case FOPDT.name:
-            return (_flat() if found == "1b" else _sharp(dead_time)), why
-        case UNSTABLE_FOPDT.name:
-            return _unstable(dead_time), why
-        case LAG_N.name if known.order == 1:
-            return _sharp(dead_time), why
-        case LAG_N.name if known.order:
-            return _lags(known.order, dead_time), why
-        case LAG_N.name:
-            return _lags(2 if found == "2" else HIGHER_ORDER, dead_time), why
-        case "" if known.order > 1:
-            return _lags(known.order, dead_time), why
-        case "":
-            pass
-        case other:
-            raise IdentificationError(
-                f"{METHOD} has no structure {other!r}; it has fopdt, unstable_fopdt and lag_n"
-            )
-    if found == "1a":
-        return _by_peak(reading, shape, dead_time, why)
-    if found == "1b":
-        return _flat(), f"{why}: FOPDT"
-    if found == "2":
-        return _lags(2, dead_time), f"{why}: two equal lags with little dead time"
-    text = (
-        f"{why}: {HIGHER_ORDER} equal lags, which stand for any higher order; the data do not "
-        "check that"
-    )
-    return _lags(HIGHER_ORDER, dead_time), text
+    if not math.isnan(dead_time):
+        reading = reading.given("time_to_peak", dead_time)
+    orders = {"2": 2, "3": HIGHER_ORDER}
+    structure = known.structure or (LAG_N.name if known.order > 1 else "")
+    if structure == FOPDT.name:
+        return (_FLAT if found == "1b" else _SHARP), reading, why
+    if structure == UNSTABLE_FOPDT.name:
+        return _UNSTABLE, reading, why
+    if structure == LAG_N.name:
+        order = known.order or orders.get(found, HIGHER_ORDER)
+        return (_SHARP if order == 1 else _lags(order, dead_time)), reading, why
+    if structure:
+        raise IdentificationError(
+            f"{METHOD} has no structure {structure!r}; it has fopdt, unstable_fopdt and lag_n"
+        )
+    if found in orders:
+        row = _lags(orders[found], dead_time)
+        text = {
+            "2": "two equal lags with little dead time",
+            "3": f"{HIGHER_ORDER} equal lags, which stand for any higher order; the data do not "
+            "check that",
+        }[found]
+    elif found == "1b":
+        row, text = _FLAT, "FOPDT"
+    else:
+        row, text = _by_peak(reading, known=not math.isnan(dead_time))
+    return row, reading, f"{why}: {text}"
 
 
-def _by_peak(reading: Reading, shape: Shape, dead_time: float, why: str) -> tuple[Solver, str]:
+def _by_peak(reading: Reading, *, known: bool) -> tuple[Row, str]:
     """Tell a stable from an unstable FOPDT process by when the peak comes."""
+    shape = reading.shape
     earliest = 0.5 * shape.half_period * (1.0 - shape.level / shape.amplitude)
     late = shape.time_to_peak - earliest
     spread = reading.std("time_to_peak") if reading.covariance is not None else 0.0
-    if abs(late) <= max(_DEVIATIONS * spread, 1e-9 * earliest) and math.isnan(dead_time):
-        return _integrating(), (
-            f"{why}: FOPDT, but with its peak within {_DEVIATIONS:g} standard deviations of P/4: "
+    if abs(late) <= max(_DEVIATIONS * spread, 1e-9 * earliest) and not known:
+        return _INTEGRATING, (
+            f"FOPDT, but with its peak within {_DEVIATIONS:g} standard deviations of P/4: "
             "the time constant is too long to be told from an integrator's or an unstable one's; "
             "gain/time constant is determined and given as the gain of an integrator. A biased "
             "relay would determine the static gain"
         )
     if late > 0.0:
-        return _sharp(dead_time), f"{why}: FOPDT"
-    return _unstable(dead_time), f"{why}, and its peak comes before P/4: unstable FOPDT"
+        return _SHARP, "FOPDT"
+    return _UNSTABLE, "its peak comes before P/4, so that it is an unstable FOPDT"
 
 
-def _peak_time(shape: Shape, dead_time: float) -> float:
-    return shape.time_to_peak if math.isnan(dead_time) else dead_time
+def _integrator(s: Shape, level: float | None) -> tuple[float, float]:
+    epsilon = level or 0.0
+    if not (s.time_to_peak > 0.0 and s.amplitude > epsilon):
+        raise IdentificationError(
+            f"the peak of {s.amplitude:g} comes {s.time_to_peak:g} s after the switch at "
+            f"{epsilon:g}: this is no limit cycle of a process with dead time"
+        )
+    # Half a period takes y from epsilon up to a, in D, and down to -epsilon.
+    return (s.amplitude - epsilon) / s.time_to_peak, s.time_to_peak
 
 
-def _sharp(dead_time: float) -> Solver:
-    def solve(s: Shape, level: float | None) -> FloatArray:
-        return np.array(fopdt(s.period, s.amplitude, _peak_time(s, dead_time), 1.0, level or 0.0))
-
-    return Solver("FOPDT", "eqs 10 and 11", FOPDT, solve)
+def _flat(s: Shape, level: float | None) -> tuple[float, float, float]:
+    return flat_fopdt(s.period, s.amplitude, s.rise, s.rise_half, 1.0, level)
 
 
-def _unstable(dead_time: float) -> Solver:
-    def solve(s: Shape, level: float | None) -> FloatArray:
-        peak = _peak_time(s, dead_time)
-        return np.array(unstable_fopdt(s.period, s.amplitude, peak, 1.0, level or 0.0))
-
-    return Solver("unstable FOPDT", "eqs 16 and 17", UNSTABLE_FOPDT, solve)
-
-
-def _integrating() -> Solver:
-    def solve(s: Shape, level: float | None) -> FloatArray:
-        epsilon = level or 0.0
-        if not (s.time_to_peak > 0.0 and s.amplitude > epsilon):
-            raise IdentificationError(
-                f"the peak of {s.amplitude:g} comes {s.time_to_peak:g} s after the switch at "
-                f"{epsilon:g}: this is no limit cycle of a process with dead time"
-            )
-        # Half a period takes y from epsilon up to a, in D, and down to -epsilon.
-        return np.array(((s.amplitude - epsilon) / s.time_to_peak, s.time_to_peak))
-
-    return Solver("integrator with dead time", "the limit of eqs 10 and 11", IPDT, solve)
+_SHARP = Row(
+    *("FOPDT", "eqs 10 and 11", FOPDT),
+    lambda s, level: fopdt(s.period, s.amplitude, s.time_to_peak, 1.0, level or 0.0),
+)
+_UNSTABLE = Row(
+    *("unstable FOPDT", "eqs 16 and 17", UNSTABLE_FOPDT),
+    lambda s, level: unstable_fopdt(s.period, s.amplitude, s.time_to_peak, 1.0, level or 0.0),
+)
+_INTEGRATING = Row(
+    *("integrator with dead time", "the limit of eqs 10 and 11", IPDT), _integrator, harmonic=True
+)
+_FLAT = Row(*("FOPDT", "eqs 20 to 22", FOPDT), _flat, harmonic=True)
 
 
-def _flat() -> Solver:
-    def solve(s: Shape, level: float | None) -> FloatArray:
-        return np.array(flat_fopdt(s.period, s.amplitude, s.rise, s.rise_half, 1.0, level))
-
-    return Solver("FOPDT", "eqs 20 to 22", FOPDT, solve, ideal=None)
-
-
-def _lags(order: int, dead_time: float) -> Solver:
+def _lags(order: int, dead_time: float) -> Row:
     """K/(tau s + 1)^n with the dead time that is known, or that the category assumes."""
-    ratio = SMALL_DEAD_TIME if order == 2 else 0.0
-    assumed = {"ratio": ratio} if math.isnan(dead_time) else {"dead_time": dead_time}
+    assumed = SMALL_DEAD_TIME if order == 2 else 0.0
+    known = not math.isnan(dead_time)
 
-    def solve(s: Shape, level: float | None) -> FloatArray:
-        if level is not None:
-            found = lags_from_cycle(order, s.period, s.amplitude, 1.0, level, **assumed)
-        elif order == 2:
-            found = small_dead_time(s.period, s.amplitude, 1.0)
-        else:
-            return np.array(higher_order(s.period, s.amplitude, 1.0, order))
-        return np.array(found[:2])
+    def solve(s: Shape, level: float | None) -> tuple[float, float]:
+        cycle = SymmetricCycle(s.period, s.amplitude, 1.0, 0.0, 0.0, level or 0.0)
+        if level is None:
+            return equal(order, cycle, wave=FIRST, ratio=assumed)
+        if known:
+            return equal(order, replace(cycle, dead_time=dead_time))
+        return equal(order, cycle, ratio=assumed)
 
     lags = LAG_N.of_order(order)
-    return Solver(
-        f"{order} equal lags",
-        "eqs 23 and 24" if order == 2 else "eqs 26 and 27",
-        _TiedLags(lags.name, lags.factors, given=dead_time, ratio=ratio),
-        solve,
-        ideal=None,
-    )
+    structure = _TiedLags(lags.name, lags.factors, given=dead_time, ratio=assumed)
+    equations = "eqs 23 and 24" if order == 2 else "eqs 26 and 27"
+    return Row(f"{order} equal lags", equations, structure, solve, harmonic=True)
 
 
 def _identified(
-    solver: Solver, reading: Reading, relay: float, extra: float, warnings: list[str]
+    row: Row, reading: Reading, relay: float, extra: float, warnings: list[str]
 ) -> Identification:
-    shape, structure = reading.shape, solver.structure
+    shape, structure = reading.shape, row.structure
     if isinstance(structure, _TiedLags):
         structure = replace(structure, extra=extra)
 
-    def scaled(values: FloatArray) -> FloatArray:
-        moved = values.copy()
-        moved[0] /= relay
+    def values(s: Shape, level: float | None) -> FloatArray:
+        found = np.array(row.solve(s, level))
+        found[0] /= relay
         if DEAD_TIME in structure.parameters:
-            moved[-1] = max(moved[-1] - extra, 0.0)
-        return moved
+            found[-1] = max(found[-1] - extra, 0.0)
+        return found
 
-    values = scaled(solver.exact(shape))
+    best = values(shape, shape.level)
     covariance, quantile = None, NORMAL_95
     if reading.covariance is not None:
-        slopes = _jacobian(lambda s: scaled(solver.exact(s)), reading)
-        if slopes is not None:
-            covariance = slopes @ reading.covariance @ slopes.T
+
+        def of_features(features: FloatArray) -> FloatArray:
+            moved = reading.at(features)
+            return values(moved, moved.level)
+
+        covariance = carried(of_features, reading.features, reading.covariance)
         quantile = float(stdtrit(reading.cycles - 1, 0.975))
-    found = identified(METHOD, Estimate.of(structure, values, covariance), quantile)
-    remarks = (*_literal(solver, shape, scaled, found), *_sensitive(solver, shape))
+    found = identified(METHOD, Estimate.of(structure, best, covariance), quantile)
+    remarks = (*_literal(row, shape, values, found), *_sensitive(row, shape))
     return replace(found, warnings=(*found.warnings, *warnings, *remarks))
 
 
-def _jacobian(solve: Callable[[Shape], FloatArray], reading: Reading) -> FloatArray | None:
-    """Return the derivatives of the values by the shape; None where one has no solution."""
-    shape, names = reading.shape, reading.names
-    size = [shape.amplitude if n in ("amplitude", "level") else shape.half_period for n in names]
-    spread = np.array([reading.std(name) for name in names])
-    at = np.array([getattr(shape, name) for name in names])
-
-    def values(x: FloatArray) -> FloatArray:
-        return solve(replace(shape, **dict(zip(names, x.tolist(), strict=True))))
-
-    try:
-        return jacobian(values, at, np.maximum(_STEP * spread, 1e-9 * np.array(size)))
-    except IdentificationError:
-        return None
-
-
 def _literal(
-    solver: Solver, shape: Shape, scaled: Callable[[FloatArray], FloatArray], found: Identification
+    row: Row,
+    shape: Shape,
+    values: Callable[[Shape, float | None], FloatArray],
+    found: Identification,
 ) -> list[str]:
     """Return what the paper's equations give, where that differs."""
-    begin = f"as in the paper, for an ideal relay, {solver.equations} "
-    if solver.equations not in ("eqs 10 and 11", "eqs 16 and 17"):
-        begin = f"as in the paper, by the first harmonic, {solver.equations} "
+    by = "by the first harmonic" if row.harmonic else "for an ideal relay"
+    begin = f"as in the paper, {by}, {row.equations} "
     try:
-        values = scaled(solver.literal(shape))
+        literal = values(shape, None)
     except IdentificationError:
         return [f"{begin}would have no solution: the relay switched at {shape.level:.4g}"]
-    if np.allclose(values, found.values, rtol=_TOO_LITTLE_DIFFERENCE, atol=0.0):
+    if np.allclose(literal, found.values, rtol=_TOO_LITTLE_DIFFERENCE, atol=0.0):
         return []
     numbers = ", ".join(
         f"{name.replace('_', ' ')} {value:.4g}"
-        for name, value in zip(found.parameters, values, strict=True)
+        for name, value in zip(found.parameters, literal, strict=True)
     )
-    point = ultimate_point(found.estimate.structure.build(values))
+    point = ultimate_point(found.estimate.structure.build(literal))
     ultimate = f", K_u {point.gain:.4g}" if point else ""
     return [f"{begin}would give {numbers}{ultimate}"]
 
 
-def _sensitive(solver: Solver, shape: Shape) -> list[str]:
+def _sensitive(row: Row, shape: Shape) -> list[str]:
     """Return how much K_u depends on the dead time that two lags are assumed to have."""
-    if solver.name != "2 equal lags":
+    if row.name != "2 equal lags":
         return []
     points = []
+    cycle = SymmetricCycle(shape.period, shape.amplitude, 1.0, 0.0, 0.0, shape.level)
     for ratio in (SMALL_DEAD_TIME, _OTHER_RATIO):
         try:
-            gain, tau, dead_time = small_dead_time(
-                shape.period, shape.amplitude, 1.0, ratio, shape.level
-            )
+            gain, tau = equal(2, cycle, ratio=ratio)
         except IdentificationError:
             return []
-        points.append(ultimate_point(LAG_N.of_order(2).build((gain, tau, dead_time))))
+        points.append(ultimate_point(LAG_N.of_order(2).build((gain, tau, ratio * tau))))
     first, second = points
     if first is None or second is None:
         return []

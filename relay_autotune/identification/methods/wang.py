@@ -15,9 +15,8 @@ levels at which the relay was seen to switch take the place of its hysteresis.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
@@ -25,10 +24,11 @@ from scipy.special import ndtr, stdtrit
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.estimate import Estimate, carried
 from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.methods.first_order import first_order
 from relay_autotune.identification.result import Identification, identified
-from relay_autotune.identification.shown.fold import Fold, as_switched, fold, fold_without
+from relay_autotune.identification.shown.fold import Fold, fold, level_at_switch, scatter_of_fold
 from relay_autotune.identification.shown.fourier import (
     UNKNOWN_REST,
     StaticGain,
@@ -60,36 +60,6 @@ class FopdtCycle:
     low: float
     up: float
     down: float
-
-
-def fopdt_limit_cycle(
-    gain: float, time_constant: float, dead_time: float, mu: float, mu0: float, epsilon: float
-) -> FopdtCycle:
-    """Return the limit cycle of a FOPDT process under a relay (eqs 2 to 5).
-
-    :param gain: K > 0 [y/u].
-    :param time_constant: T > 0 [s].
-    :param dead_time: L > 0 [s].
-    :param mu: amplitude of the relay [u].
-    :param mu0: its bias [u].
-    :param epsilon: its hysteresis [y].
-    :raises IdentificationError: if ``K (mu - |mu0|) <= epsilon``: there is no limit cycle.
-    """
-    k, t = gain, time_constant
-    if not k * (mu - abs(mu0)) > epsilon:
-        raise IdentificationError(
-            f"no limit cycle: K (mu - |mu0|) = {k * (mu - abs(mu0)):g} must exceed the "
-            f"hysteresis {epsilon:g}"
-        )
-    rise, decay = math.exp(dead_time / t), math.exp(-dead_time / t)
-    upward = (2 * mu * k * rise + mu0 * k - mu * k + epsilon) / (mu * k + mu0 * k - epsilon)
-    downward = (2 * mu * k * rise - mu * k - mu0 * k + epsilon) / (mu * k - mu0 * k - epsilon)
-    return FopdtCycle(
-        high=t * math.log(upward),
-        low=t * math.log(downward),
-        up=(mu0 + mu) * k * (1.0 - decay) + epsilon * decay,
-        down=(mu0 - mu) * k * (1.0 - decay) - epsilon * decay,
-    )
 
 
 def fopdt_from_biased(
@@ -124,6 +94,8 @@ def fopdt_from_biased(
 
 # A/(mu A_0), the limit of eq 25 for T -> infinity: the triangle of an integrator.
 INTEGRATOR_RATIO = 0.5 * math.pi
+# Ends of P/(4 T).
+_SMALLEST_Q, _LARGEST_Q = 2.5e-5, 300.0
 
 
 def fopdt_from_unbiased(
@@ -139,29 +111,21 @@ def fopdt_from_unbiased(
     :raises IdentificationError: if eq 25 has no solution, so that no stable FOPDT process has
         this limit cycle.
     """
-    w0 = 2.0 * math.pi / period
+    ratio = amplitude / (mu * response)
 
-    def mismatch(log_t: float) -> float:
-        t = math.exp(log_t)
-        reach = mu * response * math.hypot(w0 * t, 1.0)
-        # Eq 25 with the exponential taken to the other side, so that nothing overflows.
-        return reach * -math.expm1(-period / (2.0 * t)) - amplitude * (
-            1.0 + math.exp(-period / (2.0 * t))
-        )
+    def excess(q: float) -> float:
+        # It falls from an integrator's pi/2 to 1.
+        return math.tanh(q) * math.hypot(0.5 * math.pi / q, 1.0) - ratio
 
-    grid = np.linspace(math.log(period * 1e-4), math.log(period * 1e4), 400)
-    values = np.array([mismatch(x) for x in grid])
-    signs = np.flatnonzero(values[:-1] * values[1:] < 0.0)
-    if signs.size == 0:
+    low, high = _SMALLEST_Q, _LARGEST_Q
+    if not excess(low) > 0.0 > excess(high):
         raise IdentificationError(
             f"no stable FOPDT process has a limit cycle of period {period:g} s, amplitude "
             f"{amplitude:g} and |G| = {response:g} at its fundamental: the process is of another "
             "structure, or noise spoils the peaks; try the waveform method"
         )
-    i = int(signs[-1])
-    t = math.exp(float(brentq(mismatch, grid[i], grid[i + 1], xtol=1e-300, rtol=1e-15)))
-    k = response * math.hypot(w0 * t, 1.0)
-    return fopdt_with_gain(k, period, amplitude, mu, epsilon)
+    q = float(brentq(excess, low, high, xtol=1e-300, rtol=1e-15))
+    return fopdt_with_gain(amplitude / (mu * math.tanh(q)), period, amplitude, mu, epsilon)
 
 
 def fopdt_with_gain(
@@ -176,9 +140,10 @@ def fopdt_with_gain(
     :param epsilon: its hysteresis [y].
     :raises IdentificationError: if no FOPDT process of this gain has the limit cycle.
     """
-    whole = _log_ratio(mu * gain + amplitude, mu * gain - amplitude, "eq 21")
-    dead = _log_ratio(mu * gain - epsilon, mu * gain - amplitude, "eq 22")
-    return gain, 0.5 * period / whole, 0.5 * period * dead / whole
+    _log_ratio(mu * gain + amplitude, mu * gain - amplitude, "eq 21")
+    _log_ratio(mu * gain - epsilon, mu * gain - amplitude, "eq 22")
+    q = math.atanh(amplitude / (mu * gain))
+    return gain, *first_order(q, period, amplitude, mu, epsilon)[1:]
 
 
 def _log_ratio(numerator: float, denominator: float, where: str) -> float:
@@ -191,7 +156,6 @@ def _log_ratio(numerator: float, denominator: float, where: str) -> float:
 
 
 _LEAST_CYCLES = 3
-_MOST_PARTS = 20
 # Standard deviations above an integrator's ratio beyond which noise does not explain a ratio.
 _CERTAIN = 3.0
 _LIKE_AN_INTEGRATOR = (
@@ -199,23 +163,6 @@ _LIKE_AN_INTEGRATOR = (
     "gain and time constant hardly more than the ratio is known; a biased relay or the method "
     "waveform determines both"
 )
-
-
-@dataclass(frozen=True)
-class _Facts:
-    """The facts that are the same for all cycles.
-
-    :param sign: +1, or -1 for a reverse-acting relay.
-    :param gain: K [y/u], with its sign; NaN: to be found.
-    :param rest: measurement at rest [y].
-    :param ratio: amplitude of the measurement over that of the relay times the response at the
-        fundamental; NaN: that of the cycles.
-    """
-
-    sign: int
-    gain: float
-    rest: float
-    ratio: float = math.nan
 
 
 def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
@@ -231,26 +178,45 @@ def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
         FOPDT process.
     """
     test = relay_test("wang_biased", record)
-    rest = steady_state(record, test.whole.settings)
+    settings = test.whole.settings
+    rest = steady_state(record, settings)
     gain = (
         static_gain(test, rest)
         if math.isnan(known.gain)
         else StaticGain(known.gain, 0.0, math.inf)
     )
-    sign = -1 if test.whole.settings.reverse_acting else 1
+    sign = -1 if settings.reverse_acting else 1
     if not sign * gain.value > 0.0:
         raise IdentificationError(
             f"a gain of {gain.value:g} is against the direction of the relay: the state before "
             "the test was not steady, the load changed, or the known gain has the wrong sign"
         )
-    facts = _Facts(sign, gain.value, rest.value)
-    uncertain = [replace(facts, gain=gain.value + gain.scatter)]
-    if rest.measured:
-        # A steady state that is a little higher makes the gain lower.
-        lower = gain.value - rest.std / gain.excursion
-        uncertain.append(replace(facts, gain=lower, rest=rest.value + rest.std))
+
+    def solve(features: FloatArray) -> tuple[float, float, float]:
+        high, low, down, up, at_high, at_low, measured, error = features.tolist()
+        # A steady state that is a little higher makes the gain lower; with the command turned
+        # round a reverse-acting process has a positive gain.
+        k = sign * (measured - error / gain.excursion)
+        about = 0.5 * (at_high + at_low)
+        bias = sign * settings.bias - (settings.setpoint + about - rest.value - error) / k
+        high, low = (high, low)[::sign]
+        cycle = FopdtCycle(high, low, up - about, down - about)
+        epsilon = 0.5 * sign * (at_low - at_high)
+        return fopdt_from_biased(cycle, k, settings.amplitude, bias, epsilon)
+
+    def features(seen: Fold) -> FloatArray:
+        at = seen(np.array([0.0, seen.period_high]))
+        return np.array((seen.period_high, seen.period_low, *seen.peaks(), *at, gain.value, 0.0))
+
+    found, covariance = _features(test, record, features)
+    if sign * (found[5] - found[4]) < 0.0:
+        # Noise put the levels in the order in which no relay switches.
+        found[4:6] = np.mean(found[4:6])
+    if covariance is not None:
+        covariance[6, 6] = gain.scatter**2
+        covariance[7, 7] = rest.std**2 if rest.measured else 0.0
     remark = "" if rest.measured else UNKNOWN_REST
-    return _identified("wang_biased", test, record, _from_biased, facts, tuple(uncertain), remark)
+    return _identified("wang_biased", test, solve, found, covariance, remark)
 
 
 def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
@@ -265,172 +231,87 @@ def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
     :raises IdentificationError: if the relay was biased, or no FOPDT process has the limit cycle.
     """
     test = relay_test("wang_unbiased", record)
-    require_unbiased("wang_unbiased", test.whole.settings)
-    sign = -1 if test.whole.settings.reverse_acting else 1
-    known_gain(known, sign)
-    facts = _Facts(sign, known.gain, math.nan)
-    run = partial(_identified, "wang_unbiased", test, record, _from_unbiased)
-    if not math.isnan(known.gain):
-        return run(facts, (), "")
-    try:
-        found = run(facts, (), "")
-    except IdentificationError:
-        likely = _likely_ratio(test, record)
-        if likely is None:
-            raise
-        ratio, std = likely
-        remark = _LIKE_AN_INTEGRATOR
-    else:
-        likely = None
-        if not bool(np.all(np.isfinite(found.covariance))):
-            likely = _likely_ratio(test, record)
-        if likely is None:
-            return found
-        (ratio, std), remark = likely, ""
-    lower = replace(facts, ratio=ratio - std)
-    return run(replace(facts, ratio=ratio), (lower,), remark)
+    settings = test.whole.settings
+    require_unbiased("wang_unbiased", settings)
+    gain = known_gain(known, -1 if settings.reverse_acting else 1)
+    mu = settings.amplitude
+
+    def solve(features: FloatArray) -> tuple[float, float, float]:
+        period, amplitude, epsilon, ratio = features.tolist()
+        if math.isnan(gain):
+            response = amplitude / (mu * ratio)
+            return fopdt_from_unbiased(period, amplitude, response, mu, epsilon)
+        return fopdt_with_gain(gain, period, amplitude, mu, epsilon)
+
+    def features(seen: Fold) -> FloatArray:
+        down, up = seen.peaks()
+        amplitude = 0.5 * (up - down)
+        ratio = amplitude / (mu * abs(seen.fundamental())) if math.isnan(gain) else 1.0
+        return np.array((seen.period, amplitude, level_at_switch(seen), ratio))
+
+    found, covariance = _features(test, record, features)
+    # Noise may put it below zero, where no relay switches; the scatter is to both sides.
+    found[2] = max(found[2], 0.0)
+    remark = ""
+    if math.isnan(gain) and covariance is not None:
+        ratio, std = _likely_ratio(float(found[3]), math.sqrt(covariance[3, 3]))
+        if ratio != found[3]:
+            remark, found[3] = _LIKE_AN_INTEGRATOR, ratio
+            covariance[3], covariance[:, 3] = 0.0, 0.0
+            covariance[3, 3] = std**2
+    return _identified("wang_unbiased", test, solve, found, covariance, remark)
 
 
-def _likely_ratio(test: RelayTest, record: Record) -> tuple[float, float] | None:
-    """Return expectation and scatter of the ratio, given that it is below an integrator's.
+def _likely_ratio(ratio: float, scatter: float) -> tuple[float, float]:
+    """Return expectation and scatter of a ratio, given that it is below an integrator's.
 
-    :param test: the relay test.
-    :param record: the record.
-    :return: None where the cycles are too few, or the ratio is far above.
+    :return: the ratio itself where it is below, or far above.
     """
-    cycles = test.whole.cycle.cycles
-    if len(cycles) < _LEAST_CYCLES:
-        return None
-    seen = _ratio(fold(record, cycles))
-    parts = np.array([_ratio(part) for part in _without_each(record, cycles)])
-    scatter = math.sqrt(float(np.var(parts)) * (len(cycles) - 1))
-    room = INTEGRATOR_RATIO - seen
-    if room > 0.0:
-        return seen, scatter
-    if not -room < _CERTAIN * scatter:
-        return None
+    room = INTEGRATOR_RATIO - ratio
+    if room > 0.0 or not -room < _CERTAIN * scatter:
+        return ratio, scatter
     # Mean and variance of a normal distribution below a limit.
     a = room / scatter
     beyond = math.exp(-0.5 * a * a) / (math.sqrt(2.0 * math.pi) * float(ndtr(a)))
-    return seen - scatter * beyond, scatter * math.sqrt(1.0 - a * beyond - beyond**2)
+    return ratio - scatter * beyond, scatter * math.sqrt(1.0 - a * beyond - beyond**2)
 
 
-def _ratio(seen: Fold) -> float:
-    down, up = seen.peaks()
-    return 0.5 * (up - down) / (as_switched(seen).amplitude * abs(seen.fundamental()))
-
-
-def _without_each(record: Record, cycles: tuple[int, ...]) -> Iterator[Fold]:
-    """Yield the averages that leave out one cycle each; of many cycles, not every one."""
-    for left_out in cycles[:: -(-len(cycles) // _MOST_PARTS)]:
-        yield fold_without(record, cycles, left_out)
-
-
-def _from_biased(seen: Fold, facts: _Facts) -> FloatArray:
-    # With the command turned round a reverse-acting process has a positive gain.
-    settings, gain = as_switched(seen), facts.sign * facts.gain
-    high, low = (seen.period_high, seen.period_low)[:: facts.sign]
-    about = settings.setpoint
-    down, up = (p - about + seen.settings.setpoint for p in seen.peaks())
-    bias = facts.sign * settings.bias - (about - facts.rest) / gain
-    cycle = FopdtCycle(high, low, up, down)
-    k, t, dead = fopdt_from_biased(cycle, gain, settings.amplitude, bias, settings.hysteresis)
-    return np.array((facts.sign * k, t, dead))
-
-
-def _from_unbiased(seen: Fold, facts: _Facts) -> FloatArray:
-    settings = as_switched(seen)
-    down, up = seen.peaks()
-    amplitude, period = 0.5 * (up - down), seen.period
-    if math.isnan(facts.gain):
-        response = abs(seen.fundamental())
-        if not math.isnan(facts.ratio):
-            response = amplitude / (settings.amplitude * facts.ratio)
-        k, t, dead = fopdt_from_unbiased(
-            period, amplitude, response, settings.amplitude, settings.hysteresis
-        )
-    else:
-        k, t, dead = fopdt_with_gain(
-            facts.sign * facts.gain, period, amplitude, settings.amplitude, settings.hysteresis
-        )
-    return np.array((facts.sign * k, t, dead))
-
-
-_Measure = Callable[[Fold, _Facts], FloatArray]
+def _features(
+    test: RelayTest, record: Record, features: Callable[[Fold], FloatArray]
+) -> tuple[FloatArray, FloatArray | None]:
+    """Return what is measured on the averaged period, and its covariance."""
+    cycles = test.whole.cycle.cycles
+    return features(fold(record, cycles)), scatter_of_fold(record, cycles, features)
 
 
 def _identified(
     method: str,
     test: RelayTest,
-    record: Record,
-    measure: _Measure,
-    facts: _Facts,
-    uncertain: tuple[_Facts, ...],
+    solve: Callable[[FloatArray], tuple[float, float, float]],
+    features: FloatArray,
+    covariance: FloatArray | None,
     remark: str,
 ) -> Identification:
-    """Measure on the averaged period, with the uncertainty by leaving out each cycle.
+    """Solve for the averaged period, with the uncertainty of what was measured on it.
 
-    :param uncertain: facts of which one each is off by its standard deviation.
+    :param solve: from features to K > 0, T and L.
     :param remark: for the user; may be empty.
     """
-    settings = test.whole.settings
-    cycles = test.whole.cycle.cycles
-    whole = fold(record, cycles)
+    settings, cycle = test.whole.settings, test.whole.cycle
 
-    def values(seen: Fold, known: _Facts) -> FloatArray:
-        found = measure(seen, known)
+    def values(numbers: FloatArray) -> FloatArray:
+        k, t, dead = solve(numbers)
         # The dead time that the relay added is not the process's.
-        found[2] = max(found[2] - settings.extra_delay, 0.0)
-        return found
+        dead = max(dead - settings.extra_delay, 0.0)
+        return np.array((-k if settings.reverse_acting else k, t, dead))
 
-    best = values(whole, facts)
-    covariance = None
-    if len(cycles) >= _LEAST_CYCLES:
-        covariance = _jackknife(
-            record, cycles, lambda part: values(part, facts), partly=method == "wang_biased"
-        )
+    best = values(features)
     if covariance is not None:
-        for other in uncertain:
-            covariance = covariance + _by(lambda known: values(whole, known), other, best)
-    remarks = [remark, "" if test.whole.cycle.converged else NOT_SETTLED]
+        covariance = carried(values, features, covariance)
+    remarks = [remark, "" if cycle.converged else NOT_SETTLED]
     return identified(
         method,
         Estimate.of(FOPDT, best, covariance),
-        float(stdtrit(max(len(cycles) - 1, 1), 0.975)),
+        float(stdtrit(max(len(cycle.cycles) - 1, 1), 0.975)),
         warnings=tuple(r for r in remarks if r),
     )
-
-
-def _jackknife(
-    record: Record, cycles: tuple[int, ...], measure: Callable[[Fold], FloatArray], *, partly: bool
-) -> FloatArray | None:
-    """Return the covariance by leaving out one cycle after the other; None: too few solve.
-
-    :param partly: True: some need not solve.
-    """
-    parts, tried = [], 0
-    for part in _without_each(record, cycles):
-        tried += 1
-        try:
-            parts.append(measure(part))
-        except IdentificationError:
-            # Without that cycle the numbers are no limit cycle; the others show the scatter.
-            continue
-    if len(parts) < (_LEAST_CYCLES if partly else tried):
-        return None
-    away = np.array(parts) - np.mean(parts, axis=0)
-    return np.asarray(away.T @ away * (len(cycles) - 1) / len(parts))
-
-
-def _by(
-    measure: Callable[[_Facts], FloatArray], uncertain: _Facts, best: FloatArray
-) -> FloatArray:
-    """Return the covariance that one uncertain fact causes."""
-    if math.isnan(uncertain.ratio) and not math.isfinite(uncertain.gain + uncertain.rest):
-        return np.full((best.size, best.size), math.nan)
-    try:
-        change = measure(uncertain) - best
-    except IdentificationError:
-        # So far off no FOPDT process has the limit cycle: nothing bounds the error.
-        return np.full((best.size, best.size), math.nan)
-    return np.outer(change, change)

@@ -15,6 +15,7 @@ The spline is fitted by least squares and may have a kink.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -383,6 +384,35 @@ def fold_without(
     return _average(record, rest, fold(record, cycles, sharp=sharp), sharp=False)
 
 
+# Of many cycles, not every one is left out.
+_LEAST_CYCLES, _MOST_PARTS = 3, 20
+
+
+def scatter_of_fold(
+    record: Record,
+    cycles: tuple[int, ...],
+    measure: Callable[[Fold], FloatArray],
+    *,
+    sharp: bool = False,
+) -> FloatArray | None:
+    """Return the covariance of what is measured on an average, by leaving out each cycle once.
+
+    :param record: with whole cycles.
+    :param cycles: numbers of the cycles that are averaged.
+    :param measure: from an averaged period to numbers, shape (n,).
+    :param sharp: as for :func:`fold`.
+    :return: shape (n, n); None for fewer than three cycles.
+    :raises IdentificationError: if there are too few samples without one of them.
+    """
+    count = len(cycles)
+    if count < _LEAST_CYCLES:
+        return None
+    left_out = cycles[:: -(-count // _MOST_PARTS)]
+    parts = np.array([measure(fold_without(record, cycles, c, sharp)) for c in left_out])
+    away = parts - np.mean(parts, axis=0)
+    return np.asarray(away.T @ away * (count - 1) / len(parts))
+
+
 @asked_once
 def _averaged(record: Record, cycles: tuple[int, ...], sharp: bool) -> Fold:
     return _average(record, cycles, None, sharp=sharp)
@@ -412,13 +442,22 @@ def as_switched(seen: Fold) -> RelaySettings:
 
     :param seen: the averaged period.
     """
-    at_high, at_low = (float(v) for v in seen(np.array([0.0, seen.period_high])))
-    half = 0.5 * (at_low - at_high) * (-1.0 if seen.settings.reverse_acting else 1.0)
+    middle = 0.5 * float(np.sum(seen(np.array([0.0, seen.period_high]))))
     return replace(
         seen.settings,
-        setpoint=seen.settings.setpoint + 0.5 * (at_high + at_low),
-        hysteresis=max(half, 0.0),
+        setpoint=seen.settings.setpoint + middle,
+        hysteresis=max(level_at_switch(seen), 0.0),
     )
+
+
+def level_at_switch(seen: Fold) -> float:
+    """Return half the distance of the levels at which the relay was seen to switch [y].
+
+    :param seen: the averaged period.
+    :return: negative where noise put them in the order in which no relay switches.
+    """
+    at_high, at_low = (float(v) for v in seen(np.array([0.0, seen.period_high])))
+    return 0.5 * (at_low - at_high) * (-1.0 if seen.settings.reverse_acting else 1.0)
 
 
 def _overlaid(

@@ -210,6 +210,17 @@ class SymmetricCycle:
         """Share of a half period that is left after the dead time, m of Chang et al."""
         return 1.0 - 2.0 * self.dead_time / self.period
 
+    def require_switching(self) -> None:
+        """Refuse a limit cycle within the switching level.
+
+        :raises IdentificationError: if the level is not below the amplitude.
+        """
+        if not abs(self.level) < self.amplitude:
+            raise IdentificationError(
+                f"an amplitude of {self.amplitude:g} is not above the hysteresis of "
+                f"{self.level:g}, so that the relay cannot have switched: check the numbers"
+            )
+
 
 def require_unbiased(method: str, settings: RelaySettings) -> None:
     """Refuse a biased relay.
@@ -220,20 +231,6 @@ def require_unbiased(method: str, settings: RelaySettings) -> None:
         raise IdentificationError(
             f"the relay had a bias of {settings.bias:g}, but the equations of {method} hold for "
             "a symmetric one: use the method wang_biased or waveform"
-        )
-
-
-def require_switching(amplitude: float, hysteresis: float) -> None:
-    """Refuse a limit cycle within the hysteresis.
-
-    :param amplitude: a [y].
-    :param hysteresis: epsilon [y].
-    :raises IdentificationError: if the hysteresis is not below the amplitude.
-    """
-    if not hysteresis < amplitude:
-        raise IdentificationError(
-            f"an amplitude of {amplitude:g} is not above the hysteresis of {hysteresis:g}, so "
-            "that the relay cannot have switched: check the numbers"
         )
 
 
@@ -276,6 +273,15 @@ class CycleReader:
             return cls(0.0, False)
         return cls(min(_excess_of_peaks(whole, noise), 0.5 * float(amplitude)), True)
 
+    def level(self, stretch: CycleRun) -> float:
+        """Return the measurement at a switch, from the middle of the peaks [y].
+
+        Noise may put it below zero, where no relay switches.
+
+        :param stretch: the cycles.
+        """
+        return _level_at_switch(stretch, self.noisy)
+
     def read(self, stretch: CycleRun, dead_time: float) -> SymmetricCycle:
         """Return the numbers of some cycles.
 
@@ -291,7 +297,7 @@ class CycleReader:
                 "amplitude of the relay"
             )
         delay = dead_time + settings.extra_delay
-        level = _level_at_switch(stretch, self.noisy)
+        level = self.level(stretch)
         return SymmetricCycle(
             period,
             amplitude - self.excess,

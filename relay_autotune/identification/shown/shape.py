@@ -15,7 +15,7 @@ How its peaks grow from the first one tells, too.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Protocol
 
 import numpy as np
@@ -24,7 +24,7 @@ from scipy.special import fdtrc
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.shown.fold import Fold, fold, fold_without
+from relay_autotune.identification.shown.fold import Fold, fold, scatter_of_fold
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.record.cycles import cycles_of, limit_cycle, settings_of
 from relay_autotune.record.record import Record, asked_once
@@ -363,6 +363,23 @@ class Reading:
     covariance: FloatArray | None
     cycles: int
 
+    @property
+    def features(self) -> FloatArray:
+        """The numbers of the shape in the covariance, shape (n,)."""
+        return np.array([getattr(self.shape, name) for name in self.names])
+
+    def at(self, features: FloatArray) -> Shape:
+        """Return the shape with other numbers."""
+        return replace(self.shape, **dict(zip(self.names, features.tolist(), strict=True)))
+
+    def given(self, name: str, value: float) -> Reading:
+        """Return the reading with a number that is known."""
+        covariance = self.covariance
+        if covariance is not None:
+            free = np.array([each != name for each in self.names])
+            covariance = covariance * np.outer(free, free)
+        return replace(self, shape=replace(self.shape, **{name: value}), covariance=covariance)
+
     def std(self, name: str) -> float:
         """Return the standard deviation of one number; NaN: not estimated."""
         if self.covariance is None:
@@ -372,7 +389,6 @@ class Reading:
 
 
 _VARYING = ("half_period", "amplitude", "level", "time_to_peak", "rise", "rise_half")
-_LEAST_CYCLES = 3
 
 
 @asked_once
@@ -396,14 +412,11 @@ def read_shape(record: Record, *, sharp: bool = False) -> Reading:
     cycles = limit_cycle(record).cycles if cycles_of(record) else ()
     whole = fold(record, cycles, sharp=sharp)
     shape = shape_of_fold(whole, _growth(record, whole.period))
-    parts = []
-    for left_out in cycles if len(cycles) >= _LEAST_CYCLES else ():
-        part = shape_of_fold(fold_without(record, cycles, left_out, sharp))
-        parts.append([getattr(part, name) for name in _VARYING])
-    covariance = None
-    if parts:
-        away = np.array(parts) - np.mean(parts, axis=0)
-        covariance = away.T @ away * (len(parts) - 1) / len(parts)
+
+    def numbers(part: Fold) -> FloatArray:
+        return Reading(shape_of_fold(part), _VARYING, None, 1).features
+
+    covariance = scatter_of_fold(record, cycles, numbers, sharp=sharp)
     return Reading(shape, _VARYING, covariance, len(cycles))
 
 

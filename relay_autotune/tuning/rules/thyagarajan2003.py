@@ -17,13 +17,14 @@ from dataclasses import replace
 from scipy.optimize import brentq
 
 from relay_autotune.errors import RelayAutotuneError, TuningError
+from relay_autotune.identification.methods.lags import equal
 from relay_autotune.identification.methods.thyagarajan2003 import (
+    HIGHER_ORDER,
     dead_time_ratio,
     flat_fopdt,
     fopdt,
-    higher_order,
-    small_dead_time,
 )
+from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.identification.shown.shape import Shape, shape_of_half_cycle
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
@@ -184,17 +185,17 @@ def _equivalent(
         else:
             values = flat_fopdt(period, amplitude, shape.rise, shape.rise_half, 1.0, 0.0)
         return TransferFunction.fopdt(*values), _table_4
-    lags = _real_lags(model)
+    lags, cycle = _real_lags(model), SymmetricCycle(period, amplitude, 1.0, 0.0, 0.0)
     if category == "2":
         if len(lags) == 2:
             return None, phase_margin
         ratio = dead_time_ratio(shape.growth)
-        k, tau, dead_time = small_dead_time(period, amplitude, 1.0, ratio, 0.0)
-        return TransferFunction.lag_n(k, tau, 2, dead_time), phase_margin
+        k, tau = equal(2, cycle, ratio=ratio)
+        return TransferFunction.lag_n(k, tau, 2, ratio * tau), phase_margin
     if len(lags) >= _LEAST_LAGS and max(lags) <= min(lags) * (1.0 + _EQUAL):
         return None, lcmax
-    k, tau = higher_order(period, amplitude, 1.0, level=0.0)
-    return TransferFunction.lag_n(k, tau, 5, 0.0), lcmax
+    k, tau = equal(HIGHER_ORDER, cycle)
+    return TransferFunction.lag_n(k, tau, HIGHER_ORDER, 0.0), lcmax
 
 
 def _real_lags(model: TransferFunction) -> tuple[float, ...]:
