@@ -271,9 +271,10 @@ def _gains(gains: Gains, verdict: Verdict) -> list[_Entry]:
     ]
     if math.isfinite(gains.overshoot):
         lines.append(("", f"set-point step: {_step(gains)}"))
-    if gains.bare is not None:
-        ms = digits(gains.bare.ms, 3)
-        lines.append(("", f"by p, i and d alone: {_step(gains.bare)}   Ms {ms}"))
+    # Gains of a message come without it.
+    bare: Performance | None = getattr(gains, "bare", None)
+    if bare is not None:
+        lines.append(("", f"by p, i and d alone: {_step(bare)}   Ms {digits(bare.ms, 3)}"))
     if gains.reason:
         lines.append(("  because", gains.reason))
     for warning in gains.warnings:

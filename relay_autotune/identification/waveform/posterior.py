@@ -73,25 +73,27 @@ class Posterior:
 def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: float) -> Posterior:
     """Return the models that a record allows, and those that each half allows.
 
-    :param fit: with its candidates.
+    :param fit: with its candidates, the chosen one first.
     :param shares: support of each candidate; their sum is 1.
     :param inflation: ratio of the variances to those of the noise that was found.
     :param frequency: about that of the loop, at which the halves are compared [rad/s].
     """
     rng = np.random.default_rng(0)
-    own = fit.candidates[0]
     halves = _halves(fit, inflation, rng)
     temper = max(_apart(halves, frequency) / _BY_CHANCE, 1.0)
     most = _most_left(fit)
     models: list[TransferFunction] = []
-    for candidate, share in zip(fit.candidates, shares, strict=True):
-        # The chosen one was fitted to the end.
-        problem, state = (
-            (fit.problem, fit.state) if candidate is own else (candidate.problem, candidate.state)
-        )
+    for candidate, share in zip(fit.candidates[1:], shares[1:], strict=True):
+        problem, state = candidate.problem, candidate.state
         count = round(DRAWS * share)
-        if count and (candidate is own or _left(problem, state)[0] <= most):
+        if count and _left(problem, state)[0] <= most:
             models += _draws(problem, state, fit.scale, inflation * temper, count, rng)
+    rest = max(DRAWS - len(models), 1)
+    models = [
+        # The chosen one was fitted to the end.
+        *_draws(fit.problem, fit.state, fit.scale, inflation * temper, rest, rng),
+        *models,
+    ]
     if temper > 1.0:
         # The process changed from one half to the other: both are among the models.
         models += [m for part in halves for m in part.models[:_SHARE]]
@@ -284,13 +286,14 @@ def _allowed(
         if gained < _SETTLED * cost:
             break
     axes, values, _ = axes_at()
-    root = axes / np.sqrt(1.0 + values**2)
+    # The symmetric root, which turns on no sign or order of the axes.
+    root = (axes / np.sqrt(1.0 + values**2)) @ axes.T
     farthest = 2.0 * float(gammaincinv(0.5 * at.size, 1.0 - _EXCLUDED))
     models: list[TransferFunction] = []
     for _ in range(_TRIES * count):
         if len(models) == count:
             break
-        drawn = _bounded(at + deviation * (root @ rng.standard_normal(values.size)))
+        drawn = _bounded(at + deviation * (root @ rng.standard_normal(at.size)))
         if cost_at(drawn) - cost > farthest:
             continue
         try:
