@@ -271,6 +271,9 @@ class Identification:
     fitted: FloatArray = field(default_factory=lambda: np.empty(0))
     # How strongly commands above and below the first one act, relative to the model.
     effects: tuple[float, float] = (1.0, 1.0)
+    # Standard deviation of the measurement beside drift, past and load, which the model has to
+    # explain [y]; NaN: the whole measurement.
+    to_explain: float = math.nan
     # Models that each half of the record allows by itself.
     halves: tuple[Part, ...] = ()
 

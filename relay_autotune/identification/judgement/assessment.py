@@ -73,10 +73,14 @@ def is_contradicted(found: Identification, record: Record) -> bool:
 def unexplained_share(found: Identification, record: Record) -> float:
     """Return the share of the measurement's variance that neither model nor noise explains.
 
+    What drift, past and load explain is no evidence for the model, and does not count.
+
     :param found: what was identified.
     :param record: the record.
     """
     variance = float(np.var(record.measurement))
+    if math.isfinite(found.to_explain):
+        variance = min(variance, found.to_explain**2)
     left = found.fit.residual_rms**2 - record.noise**2
     return max(left, 0.0) / variance if variance > 0.0 else math.nan
 

@@ -244,7 +244,8 @@ MODEL_CHECKS = (
     Check(
         name="explained",
         title="Fit",
-        what="share of the measurement's variance that neither model nor noise explains",
+        what="share of the measurement's variance beside drift, past and load that neither model "
+        "nor noise explains",
         unit="",
         doubtful=0.1,
         failed=0.5,

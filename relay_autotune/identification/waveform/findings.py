@@ -183,6 +183,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         draws=allowed.models,
         halves=allowed.halves,
         effects=problem.effects(state.coefficients),
+        to_explain=scale * _spread_beside(problem, state),
     )
     if allowed.temper > 1.0:
         told = (
@@ -192,6 +193,14 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         )
         found = replace(found, warnings=(*found.warnings, told))
     return with_what_is_determined(found, records, fit, quantile)
+
+
+def _spread_beside(problem: Problem, state: Trial) -> float:
+    """Return the standard deviation of the samples beside the terms that are no response."""
+    plain = replace(problem, unequal=False, colour=None)
+    rows = plain.seen(plain.columns(state.theta)[0][len(problem.structure.powers) :])
+    left = left_of(plain.seen(plain.y), rows)
+    return math.sqrt(float(np.mean(left**2)))
 
 
 def _frequency(fit: Fit) -> float:
