@@ -45,6 +45,7 @@ from relay_autotune.identification.waveform.separable import (
     Problem,
     Trial,
     evaluate,
+    left_of,
     refine,
 )
 from relay_autotune.process.ultimate import ultimate_point
