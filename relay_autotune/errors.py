@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -48,7 +48,27 @@ class BagError(RelayAutotuneError, ValueError):
 
 
 class SelectionError(BagError):
-    """A recording does not have the chosen topics or columns, or has them twice."""
+    """A recording does not have the chosen topics or columns, or has them twice.
+
+    :param said: what was found and expected.
+    :param choices: the flags of each selection that would do, with what speaks for it.
+    """
+
+    def __init__(self, said: str, choices: Sequence[tuple[str, str]] = ()) -> None:
+        super().__init__(said)
+        self._choices = tuple(choices)
+
+    def __str__(self) -> str:
+        return self.told()
+
+    def told(self, command: str = "") -> str:
+        """Return the error with a line to copy for each choice.
+
+        :param command: to which the flags are added; empty: they stand alone.
+        """
+        flags = ("\n  " + f"{command} {flags}".strip() for flags, _ in self._choices)
+        reasons = (f"  # {why}" * bool(why) for _, why in self._choices)
+        return super().__str__() + "".join(map("".join, zip(flags, reasons, strict=True)))
 
 
 class FieldError(RelayAutotuneError, ValueError):

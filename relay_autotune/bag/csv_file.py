@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from relay_autotune.arrays import FloatArray, IntArray
-from relay_autotune.bag.signals import TIME_UNITS, Selection, Signal
+from relay_autotune.bag.signals import TIME_UNITS, Selection, Signal, flags_of
 from relay_autotune.bag.source import open_regular
 from relay_autotune.bag.text_table import TextTable, Times, listed
 from relay_autotune.errors import BagError, SelectionError
@@ -57,6 +57,8 @@ _MEASUREMENTS = frozenset(
      "measurement", "actual", "sensor", "adc", "encoder")
 )  # fmt: skip
 _SETPOINTS = frozenset(("setpoint", "sp", "target", "reference", "ref", "desired"))
+# A text with many columns lets this many pairs be copied.
+_MOST_CHOICES = 6
 # Number of rows from which two stretches that overlap in time are two recordings.
 _RESTART = 10
 # From row to row, a time without a unit that steps more is not in seconds [s].
@@ -321,12 +323,14 @@ def _choose(path: Path, names: Sequence[str], wanted: Selection) -> tuple[int | 
                 "; expected time, measurement and command, or two columns and their sampling "
                 "period with --period S"
                 if len(names) < 3
-                else "; name two of them with --measurement NAME --command NAME, and --time NAME "
-                f"if the time is not {names[time]!r}"
-                if time is not None
                 else "; name two of them with --measurement NAME --command NAME"
+                + ("" if time is None else f", and --time NAME if it is not {names[time]!r}")
+                + ", such as"
             )
-            raise SelectionError(f"{path} has {len(names)} columns: {listed(names)}{least}")
+            raise SelectionError(
+                f"{path} has {len(names)} columns: {listed(names)}{least}",
+                _choices([names[k] for k in rest], given),
+            )
         pair = rest
     if time is not None and time in pair and wanted.time is None:
         raise SelectionError(
@@ -344,6 +348,29 @@ def _choose(path: Path, names: Sequence[str], wanted: Selection) -> tuple[int | 
     return time, pair
 
 
+def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[tuple[str, str]]:
+    """Return the flags of each pair of columns that may be measurement and command.
+
+    :param names: of the columns that are free.
+    :param given: measurement and command, as far as they are named.
+    """
+    free = [name for name in names if not _words(name) & _SETPOINTS]
+    hints = [[n for n in free if _hint(n) == way] for way in (-1, 1)]
+    unclear = [n for n in free if _hint(n) == 0]
+    pair = [
+        [name] if name is not None else hinted or unclear
+        for name, hinted in zip(given, hints, strict=True)
+    ]
+    why = "as their names say" if all(hints) else ""
+    found = [(flags_of(y, u), why) for y in pair[0] for u in pair[1] if y != u]
+    return found[:_MOST_CHOICES]
+
+
+def _hint(name: str) -> int:
+    """Return 1 for a column that is called like a command, -1 for one like a measurement."""
+    return bool(_words(name) & _COMMANDS) - bool(_words(name) & _MEASUREMENTS)
+
+
 def _swap(path: Path, names: Sequence[str], first: FloatArray, second: FloatArray) -> str:
     """Return why the first of two columns is the command; empty: the second is.
 
@@ -355,7 +382,7 @@ def _swap(path: Path, names: Sequence[str], first: FloatArray, second: FloatArra
                 f"{path}: the column {name!r} seems to be a set-point; expected the command that "
                 "the controller put out; name columns with --measurement and --command if it is"
             )
-    hints = [bool(_words(name) & _COMMANDS) - bool(_words(name) & _MEASUREMENTS) for name in names]
+    hints = [_hint(name) for name in names]
     if hints[0] != hints[1]:
         return "as their names say" if hints[0] > hints[1] else ""
     if _steps(first) and not _steps(second):

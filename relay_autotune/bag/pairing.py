@@ -27,7 +27,7 @@ from relay_autotune.bag.field_path import (
     steps_of,
     written,
 )
-from relay_autotune.bag.signals import Selection, Signal
+from relay_autotune.bag.signals import Selection, Signal, flags_of
 from relay_autotune.bag.topics import Topics, split_name
 from relay_autotune.errors import FieldError, SelectionError
 from relay_autotune.text import visible
@@ -103,11 +103,7 @@ def pair_of(topics: Topics, wanted: Selection) -> tuple[tuple[str, str], list[st
     measurement, command = wanted.measurement, wanted.command
     if wanted.joint:
         measurement, command, why = named_pair(topics, wanted)
-        flags = " ".join(
-            f"--{role} {shlex.quote(name)}"
-            for role, name in (("measurement", measurement), ("command", command))
-        )
-        notes = [f"using {flags}: {why}"]
+        notes = [f"using {flags_of(measurement, command)}: {why}"]
     if measurement is not None and command is not None:
         names = (
             _checked(topics, "measurement", measurement),
@@ -139,14 +135,12 @@ def _checked(topics: Topics, role: str, wanted: str) -> str:
 def _only(topics: Topics, pairs: Sequence[Pair]) -> tuple[tuple[str, str], list[str]]:
     if len(pairs) == 1:
         ((y, u, reason),) = pairs
-        return (y, u), [f"using --measurement {y} --command {u}: {reason}"]
+        return (y, u), [f"using {flags_of(y, u)}: {reason}"]
     if pairs:
-        listed = "".join(
-            f"\n  --measurement {y} --command {u}  ({reason})" for y, u, reason in pairs
-        )
         raise SelectionError(
             f"{topics.path} holds {len(pairs)} pairs of topics that may be measurement and "
-            f"command; choose one:{listed}"
+            "command; choose one:",
+            [(flags_of(y, u), reason) for y, u, reason in pairs],
         )
     looks = {name: characterise(t.signal).text for name, t in topics.signals().items()}
     raise SelectionError(

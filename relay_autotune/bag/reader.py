@@ -106,6 +106,23 @@ def read_experiments(
     return Recording(path, parts, tuple(notes), of_one)
 
 
+def recordings_in(path: Path) -> list[Path]:
+    """Return the recordings in a folder of them; empty: it is one itself, or holds none.
+
+    A folder without a description is one recording where its files are one series, as those of a
+    recorder that was killed are.
+
+    :param path: a file or a folder.
+    """
+    if not os.access(path, os.R_OK) or not path.is_dir():
+        return []
+    entries = sorted(path.iterdir(), key=_natural)
+    found = [e for e in entries if not e.name.startswith(".") and may_be_recording(e)]
+    series = {re.sub(r"_\d+$", "", e.name.partition(".")[0]) for e in found if _named_so(e)}
+    is_one = len(series) == 1 and all(map(_named_so, found))
+    return [] if is_one or any(e.name == "metadata.yaml" for e in entries) else found
+
+
 def may_be_recording(path: Path) -> bool:
     """Return whether a path is to be read, by its name or its first bytes.
 

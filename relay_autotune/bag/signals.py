@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
@@ -55,6 +56,11 @@ class Column(Generic[T]):
 CLOCKS = ("publish", "log", "header")
 # Units of the times in a file of text.
 TIME_UNITS = ("s", "ms", "us", "min", "h")
+
+
+def flags_of(measurement: str, command: str) -> str:
+    """Return the flags that select measurement and command, as one types them."""
+    return f"--measurement {shlex.quote(measurement)} --command {shlex.quote(command)}"
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,14 @@ from relay_autotune.control.verification import (
     proving_step,
 )
 from relay_autotune.errors import RelayAutotuneError, TuningError
-from relay_autotune.exchange.export import EXPORTS, WITHOUT_LAW, Target, exported, exports_of
+from relay_autotune.exchange.export import (
+    EXPORTS,
+    WITHOUT_LAW,
+    Target,
+    exported,
+    exports_of,
+    node_parameters,
+)
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
 from relay_autotune.experiment.settling import NO_REST_AT
 from relay_autotune.loop.gains import Controller, Gains
@@ -411,7 +418,13 @@ class AfterTune:
             words = [*words[1:], "-p", f"initial_command:={options.at}"]
             command = shlex.join(["relay_node", "--ros-args", *words])
             steps.append(("pass its commands on", prefix() + command))
-        words = ["controller_node", "--ros-args", *ros_arguments("", topics, values)]
+        # The folder of the recording keeps what belongs to the tune.
+        bag, given = self.result.bag, ros_arguments("", topics, values)
+        if bag and Path(bag).is_dir():
+            file = str(Path(bag, f"{_CONTROLLER}.yaml"))
+            write(node_parameters(gains, values), file)
+            given = [*ros_arguments("", topics), "--params-file", file]
+        words = [_CONTROLLER, "--ros-args", *given]
         return [("control with these gains", prefix() + shlex.join(words)), *steps]
 
     # Their proof.

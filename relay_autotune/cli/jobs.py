@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -31,7 +32,7 @@ from relay_autotune.cli.arguments import (
     given_quantities,
     say,
 )
-from relay_autotune.cli.table import table
+from relay_autotune.cli.table import rows, table
 from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
 from relay_autotune.exchange.export import EXPORTS, WITHOUT_LAW, Target, exported
 from relay_autotune.identification.known import Known
@@ -64,6 +65,8 @@ class Job:
     :param task: how to identify, and what is asked of the controller.
     :param jointly: whether the experiments of all recordings give one model.
     :param table_width: columns of the table for people; None: the document is wanted instead.
+    :param name_width: columns of the name in a table with one line for each experiment; 0: the
+        table tells all of a bag.
     :param export: the kind of file that is wanted instead, and where its gains go; None: none.
     :param accept_doubtful: True: the file may hold gains whose verdict is doubtful.
     """
@@ -74,8 +77,14 @@ class Job:
     task: Task
     jointly: bool = False
     table_width: int | None = None
+    name_width: int = 0
     export: tuple[str, Target] | None = None
     accept_doubtful: bool = False
+
+    @property
+    def label(self) -> str:
+        """The name without folders."""
+        return Path(self.name).name
 
 
 @dataclass(frozen=True)
@@ -118,7 +127,8 @@ def replay(
             text = _exported(analyses, *job.export, accept_doubtful=job.accept_doubtful)
             return Done(job.name, status_of(analyses), tuple(said), text), analyses
     except SelectionError as error:
-        return _failed(job, said, str(error), USAGE), ()
+        command = shlex.join(("replay", *job.paths))
+        return _failed(job, said, error.told(command), USAGE), ()
     except RelayAutotuneError as error:
         return _failed(job, said, str(error), NOTHING_FOUND), ()
     except Exception as error:
@@ -197,6 +207,10 @@ def _exported(
 
 def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> str:
     if job.table_width is not None:
+        if job.name_width:
+            # The name of the recording begins the row.
+            why = error and error.partition("\n")[0].removeprefix(job.name).lstrip(": ")
+            return "\n".join(rows(job.label, analyses, why, job.name_width, job.table_width))
         if error is not None:
             return ""
         return table(job.name, analyses, job.table_width)
@@ -250,10 +264,15 @@ def design_options(options: argparse.Namespace) -> DesignOptions:
     """Return what is asked of a controller.
 
     :param options: with those of :func:`add_design`.
-    :raises SelectionError: if a value is out of its range.
+    :raises SelectionError: if a value is out of its range, or --export names no program.
     """
     given = given_quantities(options, declared(DesignOptions))
     export = getattr(options, "export", None)
+    if export not in (None, *EXPORTS):
+        raise SelectionError(
+            f"--export {export!r} is no program that is known; expected one of "
+            f"{', '.join(EXPORTS)}"
+        )
     if "law" not in given and export in LAWS and export != WITHOUT_LAW:
         given["law"] = export
     return DesignOptions(**given)
@@ -268,7 +287,6 @@ def add_export(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     group = parser.add_argument_group("gains as a file")
     group.add_argument(
         "--export",
-        choices=EXPORTS,
         metavar="LAW",
         help="print a file that other programs load instead: yaml, or of a law of --law, which "
         "needs not be named again",

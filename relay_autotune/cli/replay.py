@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from relay_autotune.bag.reader import may_be_recording
+from relay_autotune.bag.reader import may_be_recording, recordings_in
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, add_web, check_web, guarded, say, worst
 from relay_autotune.cli.jobs import (
     Done,
@@ -30,17 +30,22 @@ from relay_autotune.cli.report import (
     command_line,
     write_report,
 )
+from relay_autotune.cli.table import heading
 from relay_autotune.cli.terminal import ProgressLine, Stages, width, write
 from relay_autotune.errors import SelectionError
 from relay_autotune.result import Analysis
 
 PROGRAM = "replay"
+# Columns of a table that names of recordings fill at most.
+_LONGEST_NAME = 32
 
 _EPILOG = """\
 A BAG is a rosbag2 directory, an .mcap file, or a table of text such as a .csv.
 Topics need not be named if the bag holds experiments of relay_node, or one pair
 of topics, each of a single number, that looks like measurement and command.
 Of several BAGs, those that are no recording are passed over, with a line each.
+Of a folder of recordings a table is printed as they are done, a line for each
+experiment.
 
 Results go to standard output, everything else to standard error.
 Exit status: 0 done; 1 nothing was identified in at least one bag; 2 the command
@@ -49,6 +54,7 @@ doubtful.
 
 Examples, with the recordings that come with the package:
   replay bags/biased_relay
+  replay --jobs 2 bags
   replay bags/heater.csv --measurement 'Temperature 1' --command 'Heater 1'
   replay --json --start 10 --rule simc bags/step_test
   replay --jobs 2 --output fleet.csv bags/*
@@ -130,8 +136,11 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
         return _into_file(jobs, options)
     status = DONE
     analyses: list[tuple[str, Analysis]] = []
+    if jobs[0].name_width:
+        write(f"{heading(jobs[0].name_width)}\n", None)
     for done, found in _in_order(jobs, options):
-        _tell(done)
+        if not jobs[0].name_width:
+            _tell(done)
         if done.text:
             write(f"{done.text}\n", file if found else None)
         status = worst(status, done.status)
@@ -157,6 +166,9 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     with_table = not (options.json or options.output)
     recordings = _recordings(options.bags)
     jobs = jobs_of(options, recordings, table_width=width() if with_table else None)
+    if with_table and len(jobs) > 1 and any(recordings_in(Path(name)) for name in options.bags):
+        name_width = min(max(len(job.label) for job in jobs), _LONGEST_NAME)
+        jobs = [replace(job, name_width=name_width) for job in jobs]
     if options.scheduler:
         # The workers of a cluster have working directories of their own.
         jobs = [replace(j, paths=tuple(str(Path(p).absolute()) for p in j.paths)) for j in jobs]
@@ -174,13 +186,19 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
 
 def _recordings(given: Sequence[str]) -> list[str]:
     """Return what of the command line can be a recording; a pattern such as bags/* names more."""
-    found = [name for name in given if len(given) == 1 or may_be_recording(Path(name))]
+    found: list[str] = []
+    left_out = []
+    for name in dict.fromkeys(given):
+        inside = recordings_in(Path(name))
+        if inside or len(given) == 1 or may_be_recording(Path(name)):
+            found += map(str, inside) if inside else [name]
+        else:
+            left_out.append(name)
     if not found:
         # The error of each then says what it is.
         return list(given)
-    for name in dict.fromkeys(given):
-        if name not in found:
-            say(PROGRAM, f"{name} is left out: it is not a recording (.mcap, .db3 or .csv)")
+    for name in left_out:
+        say(PROGRAM, f"{name} is left out: it is not a recording (.mcap, .db3 or .csv)")
     return found
 
 

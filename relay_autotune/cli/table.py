@@ -47,6 +47,48 @@ def table(bag: str, analyses: Sequence[Analysis], width: int = WIDEST) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
+# Columns of a table with one line for each experiment, and their widths.
+_VERDICT, _NUMBER = 8, 8
+_NUMBERS = ("K_u", "w_u", "kc", "ti", "td", "Ms")
+
+
+def heading(name_width: int) -> str:
+    """Return the line above :func:`rows`.
+
+    :param name_width: columns of the name.
+    """
+    return _line("", "verdict", _NUMBERS, name_width)
+
+
+def rows(
+    bag: str, analyses: Sequence[Analysis], error: str | None, name_width: int, width: int
+) -> list[str]:
+    """Return what was made of a recording, a line for each experiment.
+
+    :param bag: the recording.
+    :param analyses: one for each experiment.
+    :param error: why there are none; None: there are.
+    :param name_width: columns of the name.
+    :param width: columns that a line may have; a reason is cut there.
+    """
+    lines = [] if error is None else [_line(bag, "-", [error], name_width)]
+    for number, analysis in enumerate(analyses, start=1):
+        name = f"{bag} {number}/{len(analyses)}" if len(analyses) > 1 else bag
+        model, gains = analysis.model, analysis.best_gains
+        verdict = analysis.verdict.name.lower() if model is not None else "-"
+        cells = [analysis.reason]
+        if model is not None and gains is not None:
+            values = (model.ultimate_gain, model.ultimate_frequency, gains.kc, gains.ti, gains.td)
+            cells = [*map(digits, values), digits(gains.ms, 3)]
+        lines.append(_line(name, verdict, cells, name_width))
+    return [line if len(line) <= width else f"{line[: width - 3]}..." for line in lines]
+
+
+def _line(name: str, verdict: str, cells: Sequence[str], name_width: int) -> str:
+    told = "".join(f" {cell:>{_NUMBER}}" for cell in cells) if len(cells) > 1 else f"  {cells[0]}"
+    return f"{name:<{name_width}}  {verdict:<{_VERDICT}}{told}"
+
+
 def identification_lines(found: Identification, width: int = WIDEST) -> list[str]:
     """Return an identified model with its accuracy, as lines.
 

@@ -13,12 +13,13 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.loop.gains import Gains
-from relay_autotune.loop.laws import LAWS, OWN_LAW, Law, SampledLaw
+from relay_autotune.loop.laws import LAWS, OWN_LAW, Law
 from relay_autotune.quantities import told_fields
 
 _DIGITS = 10
@@ -78,7 +79,7 @@ def exported(gains: Gains, how: str, target: Target, *, doubt: str = "") -> str:
     """
     if how == "yaml":
         return _doubted(plain(gains), doubt, "#")
-    if gains.law not in ("", how) or (gains.law == "" and how != WITHOUT_LAW):
+    if how not in ((gains.law,) if gains.law else (WITHOUT_LAW, OWN_LAW)):
         runs = gains.law or "controller_node, as a continuous controller"
         raise SelectionError(f"the gains are for {runs}: give --law {how} to export them for it")
     law = LAWS[how]
@@ -135,38 +136,57 @@ def settings(gains: Gains, law: Law, target: Target) -> str:
     :param target: with the clamps of the command, which become a remark.
     """
     limits = (target.command_min, target.command_max)
-    low, high = (f"{limit:g}" if math.isfinite(limit) else "none" for limit in limits)
-    set_there = f"; set them to {low} and {high}" if any(map(math.isfinite, limits)) else ""
+    where = ""
+    if law.bounds is None:
+        low, high = (f"{limit:g}" if math.isfinite(limit) else "none" for limit in limits)
+        set_there = f"; set them to {low} and {high}" if any(map(math.isfinite, limits)) else ""
+        where = f"Limits of the command are set in the program{set_there}. "
     told: tuple[str, ...] = (
         f"For {law.program}.",
         f"Command: {law.command}.",
-        f"Limits of the command are set in the program{set_there}. At them: {law.limits}.",
+        f"{where}At {'them' if where else 'the limits of the command'}: {law.limits}.",
     )
     if law.sign:
         sign = law.sign.format(sign="positive" if gains.kc < 0.0 else "negative")
         told += (f"{sign}, with kc {gains.kc:.6g}.",)
-    lines = _comments(gains, told, law.remark)
-    lines += _start(law.at(gains, gains.law_period), target.present)
-    lines += [law.line.format(name=name, value=value) for name, value in _values(gains, law)]
-    return "\n".join(lines) + "\n"
+    values = list(_values(gains, law))
+    if law.bounds is not None:
+        values += _texts(law.bounds(*limits))
+    if law.start is not None:
+        known = not math.isnan(target.present)
+        at = f" At the tune it was {target.present:.6g} u." if known else ""
+        told += (f"Start without a bump: {law.start.words}{at}",)
+        if law.start.name and (known or law.start.needs):
+            present = target.present if known else 0.0
+            start = law.start.value(law.at(gains, gains.law_period), present)
+            values.append((law.start.name, number(start)))
+    return _written(law, _comments(gains, told, law.remark), values)
 
 
-def _start(law: SampledLaw, present: float) -> list[str]:
-    """Return how a program starts without a bump, where it can."""
-    start = law.law.start
-    if start is None:
-        return []
-    known = "" if math.isnan(present) else f" At the tune it was {present:.6g} u."
-    lines = [f"{law.law.remark} Start without a bump: {start.words}{known}"]
-    if start.name and known:
-        value = number(start.value(law, present))
-        lines.append(law.law.line.format(name=start.name, value=value))
-    return lines
+def node_parameters(gains: Gains, values: Mapping[str, Any]) -> str:
+    """Return the parameters of a controller_node as a file that it is started with.
+
+    :param gains: that are among them.
+    :param values: the parameters by name.
+    """
+    law = LAWS[OWN_LAW]
+    texts = [(n, number(v) if isinstance(v, float) else json.dumps(v)) for n, v in values.items()]
+    return _written(law, _comments(gains, (), law.remark), texts)
+
+
+def _written(law: Law, comments: list[str], values: Sequence[tuple[str, str]]) -> str:
+    lines = [law.line.format(name=name, value=value) for name, value in values]
+    parts = [*comments, *filter(None, [law.head]), *lines, *filter(None, [law.tail])]
+    return "\n".join(parts) + "\n"
 
 
 def _values(gains: Gains, law: Law) -> list[tuple[str, str]]:
     """Return the settings of a law as texts, those without a value left out."""
-    found = ((each.name, each.of(law.at(gains, gains.law_period))) for each in law.settings)
+    at = law.at(gains, gains.law_period)
+    return _texts((each.name, each.of(at)) for each in law.settings)
+
+
+def _texts(found: Iterable[tuple[str, float | str | None]]) -> list[tuple[str, str]]:
     return [
         (name, value if isinstance(value, str) else number(value))
         for name, value in found

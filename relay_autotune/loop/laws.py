@@ -213,6 +213,10 @@ class Setting:
         return self.value(law) if callable(self.value) else self.value
 
 
+# Returns names and values for the lowest and the highest command; None: it is left out.
+Bounds = Callable[[float, float], tuple[tuple[str, float | str | None], ...]]
+
+
 @dataclass(frozen=True)
 class Start:
     """How a program begins from the present command.
@@ -220,11 +224,13 @@ class Start:
     :param words: what to do, a sentence.
     :param name: the input that takes the value; empty: it has none.
     :param value: of that input, from the law with its gains and the command [u].
+    :param needs: True if its text does not work without a value, which is then 0.
     """
 
     words: str
     name: str = ""
     value: Callable[[SampledLaw, float], float] = lambda _law, command: command
+    needs: bool = False
 
 
 @dataclass(frozen=True)
@@ -245,7 +251,11 @@ class Law:
     :param command: unit and scale of the command.
     :param only_positive: True if it has no gains for a process of negative gain.
     :param needs_integral: True if it does not run without integral action.
+    :param head: what stands above its settings.
     :param line: how a setting is written, with ``{name}`` and ``{value}``.
+    :param tail: what stands below them.
+    :param bounds: its settings for the limits of the command, of which each may be infinite;
+        None: they are set elsewhere in the program.
     :param remark: beginning of a line that is a comment.
     :param sign: what to know where its gains have not the sign of kc; ``{sign}`` is theirs.
     :param start: how it begins from the present command; None: its program has no way.
@@ -265,7 +275,10 @@ class Law:
     command: str = "any"
     only_positive: bool = False
     needs_integral: bool = False
+    head: str = ""
     line: str = "{name}: {value}"
+    tail: str = ""
+    bounds: Bounds | None = None
     remark: str = "#"
     sign: str = ""
     start: Start | None = None
@@ -474,6 +487,10 @@ def _gains(
     return tuple(map(setting, names.split(), fields.split()))
 
 
+def _or_none(limit: float) -> float | None:
+    return limit if math.isfinite(limit) else None
+
+
 def _of_255(gain: float) -> float:
     return 255.0 * gain
 
@@ -522,6 +539,10 @@ _ROWS = (
         smoothing=_ON_MEASUREMENT,
         weights=(),
         form="ideal",
+        head="/**:\n  ros__parameters:",
+        line="    {name}: {value}",
+        bounds=lambda low, high: (("command_min", _or_none(low)), ("command_max", _or_none(high))),
+        start=Start("initial_command is the present command.", "initial_command"),
     ),
     _BACK_CALCULATION,
     _control_toolbox(
@@ -555,10 +576,28 @@ _ROWS = (
             ),
         ),
         weights=(0.0, 1.0),
+        head="#include <PID_v1.h>\n",
         line="const auto {name} = {value};",
+        # Without other limits the library has 0 to 255.
+        bounds=lambda low, high: (
+            ("OutputMin", low if math.isfinite(low) else 0.0),
+            ("OutputMax", high if math.isfinite(high) else 255.0),
+        ),
+        tail="""
+double Setpoint = 0.0, Input = 0.0, Output = StartOutput;
+PID controller(&Input, &Output, &Setpoint, Kp, Ki, Kd, POn, ControllerDirection);
+
+// at the end of setup(); then in loop(): read Input, controller.Compute(), write Output
+void startController() {
+  controller.SetOutputLimits(OutputMin, OutputMax);
+  controller.SetSampleTime(SampleTime);
+  controller.SetMode(AUTOMATIC);
+}""",
         remark="//",
         sign="Its gains are never negative: ControllerDirection says the sign",
-        start=Start("set Output to the present command before SetMode(AUTOMATIC)."),
+        start=Start(
+            "Output is the present command before SetMode(AUTOMATIC).", "StartOutput", needs=True
+        ),
     ),
     Law(
         "simple_pid",
@@ -571,7 +610,10 @@ _ROWS = (
             Setting("proportional_on_measurement", lambda law: str(law.gains.b < 0.5)),
         ),
         weights=(0.0, 1.0),
-        line="{name} = {value}",
+        head="from simple_pid import PID\n\npid = PID(",
+        line="    {name}={value},",
+        tail=")\n# pid.setpoint = ...; then, every sample_time: command = pid(measurement)",
+        bounds=lambda low, high: (("output_limits", f"({_or_none(low)}, {_or_none(high)})"),),
         start=Start("starting_output is the present command.", "starting_output"),
     ),
     Law(
@@ -590,6 +632,8 @@ _ROWS = (
         ),
         smoothing=_MEAN,
         command="level of the output, -1 (cool) to 1 (heat)",
+        head="climate:\n  - platform: pid\n    control_parameters:",
+        line="      {name}: {value}",
         start=Start("starting_integral_term is the present command.", "starting_integral_term"),
     ),
     Law(
@@ -608,6 +652,9 @@ _ROWS = (
         delay=1,
         command="power of the heater, 0 to 1; the gains are in parts of 255",
         only_positive=True,
+        head="# of printer.cfg; likewise [heater_bed] or [heater_generic NAME]\n"
+        "[extruder]\ncontrol: pid",
+        bounds=lambda _low, high: (("max_power", _or_none(high)),),
     ),
     Law(
         "marlin_heater",

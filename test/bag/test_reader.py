@@ -503,7 +503,7 @@ def test_two_pairs_are_listed_and_none_is_chosen(tmp_path):
         read_experiments(tmp_path / "bag")
     lines = str(caught.value).splitlines()
     assert "2 pairs of topics" in lines[0]
-    assert [line.split("  (")[0].strip() for line in lines[1:]] == [
+    assert [line.split("  # ")[0].strip() for line in lines[1:]] == [
         "--measurement /temperature --command /heater_1",
         "--measurement /temperature --command /heater_2",
     ]

@@ -5,10 +5,14 @@
 
 from __future__ import annotations
 
+import configparser
 import json
 import math
 import re
+import shutil
+import subprocess
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -196,7 +200,9 @@ OVEN = ("--gain", "1.65", "--time-constants", "20", "--dead-time", "10", "--samp
 def settings_of(text: str) -> dict[str, str]:
     """Read lines of `name: value`, `name = value` and the like."""
     found = re.findall(
-        r"^(?:const auto |#define |param set )?(\w+)(?:: | :?= |,| )([^;\n]+)", text, re.M
+        r"^ *(?:const auto |#define |param set )?(\w+)(?:: | :?= |=|,| )([^;\n]+?),?;?$",
+        text,
+        re.M,
     )
     return {name: value for name, value in found if not name.startswith("_")}
 
@@ -211,7 +217,9 @@ def test_a_law_gets_its_settings_in_the_words_of_its_program(name, capsys):
     assert f"Designed for {name} every 0.5 s." in text
     assert ("another proof of it was of other gains" in text) == (name != "controller_node")
     found = settings_of("\n".join(line for line in lines if not line.startswith(law.remark)))
-    assert list(found) == [each.name for each in law.settings]
+    assert [n for n in found if n in {s.name for s in law.settings}] == [
+        each.name for each in law.settings
+    ]
     gains = tune_model(
         TransferFunction.fopdt(1.65, 20.0, 10.0),
         "imc",
@@ -232,6 +240,105 @@ def test_a_block_with_the_other_error_says_the_sign_of_its_gain(gain, kp, capsys
     assert (float(settings_of(text)["KP"]) > 0.0) == (kp == "positive")
 
 
+def of_law(law: str, kc: float = 2.0) -> Gains:
+    return replace(gains(kc, 5.0), law=law, law_period=0.5)
+
+
+OF_OVEN = Target(command_min=0.0, command_max=100.0, present=35.0)
+
+
+@pytest.mark.parametrize("target", [OF_OVEN, Target()], ids=["told", "unknown"])
+def test_simple_pid_runs_what_is_exported(target):
+    module = pytest.importorskip("simple_pid")
+    made: dict[str, Any] = {}
+    exec(exported(of_law("simple_pid"), "simple_pid", target), made)
+    pid = made["pid"]
+    assert isinstance(pid, module.PID)
+    assert pid.tunings == pytest.approx((2.0, 0.4, 0.0))
+    assert (pid.sample_time, pid.proportional_on_measurement) == (0.5, False)
+    known = target is OF_OVEN
+    assert pid.output_limits == ((0.0, 100.0) if known else (None, None))
+    pid.setpoint = 20.0
+    assert pid(20.0) == pytest.approx(35.0 if known else 0.0)
+    assert pid(-100.0, dt=0.5) == pytest.approx(100.0 if known else 264.0)
+
+
+@pytest.mark.parametrize("target", [OF_OVEN, Target()], ids=["told", "unknown"])
+def test_an_arduino_sketch_compiles_and_starts_from_the_present_command(tmp_path, target):
+    text = exported(of_law("arduino_pid_v1", -2.0), "arduino_pid_v1", target)
+    (tmp_path / "PID_v1.h").write_text(PID_V1)
+    (tmp_path / "sketch.cpp").write_text(text + SHOW)
+    compiler = shutil.which("c++")
+    if compiler is None:
+        pytest.skip("there is no C++ compiler")
+    program = tmp_path / "sketch"
+    given = [compiler, "-I", str(tmp_path), str(tmp_path / "sketch.cpp"), "-o", str(program)]
+    subprocess.run(given, check=True)
+    told = subprocess.run([program], check=True, capture_output=True, text=True).stdout.split()
+    low, high, start = (0.0, 100.0, 35.0) if target is OF_OVEN else (0.0, 255.0, 0.0)
+    assert [float(word) for word in told] == [
+        2.0,
+        0.4,
+        0.0,
+        1.0,
+        1.0,
+        low,
+        high,
+        500.0,
+        1.0,
+        start,
+    ]
+
+
+# The interface of the library, which keeps what it is given.
+PID_V1 = """
+#include <cstdio>
+#define AUTOMATIC 1
+#define DIRECT 0
+#define REVERSE 1
+#define P_ON_M 0
+#define P_ON_E 1
+class PID {
+ public:
+  PID(double*, double* output, double*, double p, double i, double d, int on, int direction)
+      : output(output) { std::printf("%g %g %g %d %d ", p, i, d, on, direction); }
+  void SetOutputLimits(double low, double high) { std::printf("%g %g ", low, high); }
+  void SetSampleTime(int period) { std::printf("%d ", period); }
+  void SetMode(int mode) { std::printf("%d %g", mode, *output); }
+ private:
+  double* output;
+};
+"""
+SHOW = "int main() { startController(); }"
+
+
+def test_a_printer_reads_its_heater():
+    text = exported(of_law("klipper_heater"), "klipper_heater", replace(OF_OVEN, command_max=0.8))
+    printer = configparser.RawConfigParser(strict=False, inline_comment_prefixes=(";", "#"))
+    printer.optionxform = str
+    printer.read_string(text)
+    (section,) = printer.sections()
+    assert dict(printer[section]) == {
+        "control": "pid",
+        "pid_Kp": "510.0",
+        "pid_Ki": "102.0",
+        "pid_Kd": "0.0",
+        "max_power": "0.8",
+    }
+
+
+def test_esphome_gets_a_climate():
+    (climate,) = yaml.safe_load(exported(of_law("esphome_pid"), "esphome_pid", OF_OVEN))["climate"]
+    assert climate["platform"] == "pid"
+    assert climate["control_parameters"] == {
+        "kp": 2.0,
+        "ki": pytest.approx(0.4),
+        "kd": 0.0,
+        "output_averaging_samples": 1,
+        "starting_integral_term": 35.0,
+    }
+
+
 @pytest.mark.parametrize(
     ("law", "name"),
     [
@@ -241,10 +348,9 @@ def test_a_block_with_the_other_error_says_the_sign_of_its_gain(gain, kp, capsys
     ],
 )
 def test_a_program_starts_from_the_command_at_which_the_process_rests(law, name):
-    of_law = replace(gains(-2.0, 5.0), law=law, law_period=0.5)
-    unknown = exported(of_law, law, Target())
+    unknown = exported(of_law(law, -2.0), law, Target())
     assert "Start without a bump" in unknown and name not in settings_of(unknown)
-    found = settings_of(exported(of_law, law, Target(present=35.0)))
+    found = settings_of(exported(of_law(law, -2.0), law, Target(present=35.0)))
     # Before it runs, the block of IEC 61131-3 gives KP X0; the others' first output is theirs.
     factor = float(found["KP"]) if name == "X0" else 1.0
     assert factor * float(found[name]) == pytest.approx(35.0)
@@ -265,7 +371,7 @@ def test_gains_for_one_law_are_not_exported_for_another(capsys):
     assert tune.main([*asked, "--export", "klipper_heater"]) == 2
     assert "the gains are for simple_pid: give --law klipper_heater" in capsys.readouterr().err
     assert tune.main([*asked, "--export", "simple_pid", "--command-max", "1"]) == 0
-    assert "set them to none and 1. At them: I stays" in capsys.readouterr().out
+    assert "output_limits=(None, 1.0)" in capsys.readouterr().out
     assert tune.main([*asked, "--export", "yaml"]) == 0
     plain_law = exported(gains(1.0, 5.0), "yaml", Target())
     assert "law" not in plain_law

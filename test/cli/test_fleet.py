@@ -22,6 +22,7 @@ from fleet_work import die_of_bag_3, die_once, mark, wait_for_ever
 from made_bags import REPOSITORY
 
 from relay_autotune.analysis import Task
+from relay_autotune.bag.reader import recordings_in
 from relay_autotune.bag.signals import Selection
 from relay_autotune.cli import fleet, replay
 from relay_autotune.cli.fleet import COLUMNS, ResultsFile, in_processes, on_cluster, rows
@@ -51,6 +52,44 @@ def links(folder, count):
     for path in paths:
         path.symlink_to(STEP)
     return paths
+
+
+@pytest.mark.parametrize("more", [(), ("--jobs", "2")], ids=["one", "two"])
+def test_a_folder_of_bags_is_a_table_with_a_line_each(tmp_path, capsys, more):
+    links(tmp_path, 2)
+    (tmp_path / "broken.mcap").write_bytes(b"junk")
+    (tmp_path / "notes.txt").write_text("to be passed over")
+    status, out, err = run(capsys, "--rule", "imc", *more, tmp_path)
+    head, *rows = out.splitlines()
+    assert head.split() == ["verdict", "K_u", "w_u", "kc", "ti", "td", "Ms"]
+    assert [row.split()[0] for row in rows] == ["bag_0", "bag_1", "broken.mcap"]
+    _, json_out, _ = run(capsys, "--json", "--rule", "imc", STEP)
+    (found,) = json.loads(json_out)["experiments"]
+    gains = found["gains"][found["recommended"]]
+    for row in rows[:2]:
+        verdict, *numbers = row.split()[1:]
+        assert verdict == found["verdict"]
+        told = dict(zip(head.split()[1:], map(float, numbers), strict=True))
+        for name in ("kc", "ti", "td"):
+            assert told[name] == pytest.approx(gains[name], rel=1e-3)
+    assert "broken.mcap  -" in rows[2] and len(rows[2]) < 100
+    assert (status, err) == (1, "")
+
+
+@pytest.mark.parametrize(
+    ("files", "count"),
+    [
+        (("metadata.yaml", "a_0.mcap", "b_0.mcap"), 0),
+        (("a_0.mcap", "a_1.mcap", "a_10.mcap.zstd"), 0),
+        (("a_0.mcap", "b_0.mcap", "notes.txt"), 2),
+        (("a_0.mcap", "heater.csv"), 2),
+        (("notes.txt",), 0),
+    ],
+)
+def test_a_folder_that_is_one_recording_is_told_from_a_folder_of_them(tmp_path, files, count):
+    for name in files:
+        (tmp_path / name).touch()
+    assert len(recordings_in(tmp_path)) == count
 
 
 def test_processes_do_each_bag_once(tmp_path):

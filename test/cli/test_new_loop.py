@@ -9,6 +9,7 @@ import argparse
 import math
 import re
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -347,8 +348,15 @@ def shown(
     # The whole analysis takes seconds.
     monkeypatch.setattr(report, "analysed_as_there", analysed)
 
-    def show(passed: bool | None, against: str, *answers: str, command_type: str = FLOAT64) -> str:
+    def show(
+        passed: bool | None,
+        against: str,
+        *answers: str,
+        command_type: str = FLOAT64,
+        bag: str | None = None,
+    ) -> str:
         typed.extend(answers)
+        result.bag = tempfile.mkdtemp(dir=tmp_path) if bag is None else bag
         kinds["command_type"] = command_type
         monkeypatch.setattr(AfterTune, "_offered", lambda _: (passed, against))
         proven, steps = AfterTune(client, given, parser, nodes).hand_over()
@@ -393,7 +401,7 @@ def test_a_program_that_is_named_gets_gains_of_its_own_and_a_start_without_a_bum
 def test_somebody_without_a_controller_is_told_how_to_start_one(
     shown: Callable[..., str],
 ) -> None:
-    command = shown(None, "", "").partition("NEXT control with these gains ")[2].split()
+    command = shown(None, "", "", bag="").partition("NEXT control with these gains ")[2].split()
     assert command[command.index("--ros-args") - 1] == "controller_node"
     given = dict(word.split(":=", 1) for word in command if ":=" in word)
     assert given["controller_command"] == "/tank/valve"
@@ -405,6 +413,18 @@ def test_somebody_without_a_controller_is_told_how_to_start_one(
     assert set(given) - {"measurement", "controller_command"} <= {
         e.name for e in CONTROLLER_PARAMETERS
     }
+    # With a recording its folder keeps them, and the command is short.
+    short = shown(None, "", "").partition("NEXT control with these gains ")[2].split()
+    topics, file = short[-6:-2], Path(short[-1])
+    assert short[-7:-6] == ["--ros-args"] and short[-2] == "--params-file"
+    assert topics == [
+        *("-r", "measurement:=/tank/level", "-r", "controller_command:=/tank/valve")
+    ]  # fmt: skip
+    (section,) = yaml.safe_load(file.read_text()).values()
+    kept = section["ros__parameters"]
+    of_file = {name: str(value) for name, value in kept.items()}
+    assert of_file == {n: v for n, v in given.items() if n in of_file}
+    assert set(given) - set(of_file) == {"measurement", "controller_command"}
     # For another type relay_node stands between controller and actuator.
     both = shown(None, "", "", command_type="std_msgs/msg/Float32").partition("NEXT ")[2]
     assert "controller_command:=" not in both

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shlex
 import subprocess
 import sys
 
@@ -27,7 +28,8 @@ from made_bags import (
 from relay_autotune.analysis import analyse
 from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, Definition
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
-from relay_autotune.cli import csv_to_bag, replay, terminal
+from relay_autotune.cli import csv_to_bag, replay, terminal, tune
+from relay_autotune.exchange.export import EXPORTS
 from relay_autotune.record.record import Outcome, Record
 
 
@@ -261,6 +263,29 @@ def test_a_csv_and_the_bag_made_of_it_give_equal_numbers(tmp_path, capsys):
     model = a["experiments"][0]["models"][0]
     assert model["gain"] == pytest.approx(1.65, rel=0.02)
     assert model["dead_time"] == pytest.approx(10.0, abs=0.3)
+
+
+def test_a_csv_with_more_columns_gives_the_lines_to_copy(tmp_path, capsys):
+    rows = step_csv(tmp_path / "step.csv").read_text().splitlines()
+    path = tmp_path / "of four.csv"
+    path.write_text("".join(f"{row},{'Level SP' if not k else 1}\n" for k, row in enumerate(rows)))
+    assert replay.main([str(path)]) == 2
+    first, *lines = capsys.readouterr().err.splitlines()
+    assert "has 5 columns" in first
+    words = shlex.split(lines[0], comments=True)
+    assert words == [
+        *("replay", str(path), "--measurement", "Level [m]", "--command", "Valve (%)")
+    ]  # fmt: skip
+    assert len(lines) == 1
+    assert replay.main([*words[1:], "--rule", "imc"]) == 0
+
+
+@pytest.mark.parametrize("command", [replay, tune])
+def test_an_unknown_program_is_told_in_one_line_which_there_are(capsys, command):
+    given = ["--gain", "1", "--time-constants", "2"] if command is tune else ["bags/step_test"]
+    assert command.main([*given, "--export", "foo"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert all(name in line for name in EXPORTS)
 
 
 def test_csv_to_bag_refuses_what_it_cannot_do(tmp_path, capsys):

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,7 @@ from rclpy.parameter import parameter_dict_from_yaml_file
 from ros_domain import free_domain
 
 from relay_autotune.cli.tune import main
+from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS
 
 MODEL = ("--gain", "1.65e5", "--time-constants", "20", "--dead-time", "10")
 DOUBLES = ("p", "i", "d", "u_clamp_max", "u_clamp_min", "tracking_time_constant")
@@ -40,23 +43,42 @@ def test_as_ros2_param_load_reads_it(exported: Path) -> None:
     assert set(found) == {f"gains.heater.{n}" for n in (*DOUBLES, "antiwindup_strategy")}
 
 
-def test_as_a_node_reads_it_at_its_start(exported: Path) -> None:
+@contextmanager
+def started_with(file: Path, name: str) -> Iterator[Node]:
+    """Return a node that has the parameters of a file."""
     with free_domain() as domain:
         context = rclpy.Context()
-        arguments = ["--ros-args", "--params-file", str(exported)]
+        arguments = ["--ros-args", "--params-file", str(file)]
         rclpy.init(args=arguments, context=context, domain_id=domain)
         try:
             node = Node(
-                "pid_controller",
-                context=context,
-                automatically_declare_parameters_from_overrides=True,
+                name, context=context, automatically_declare_parameters_from_overrides=True
             )
-            for name in DOUBLES:
-                value = node.get_parameter(f"gains.heater.{name}").value
-                assert isinstance(value, float), name
-            assert node.get_parameter("gains.heater.i").value == pytest.approx(
-                node.get_parameter("gains.heater.p").value / 25.0
-            )
+            yield node
             node.destroy_node()
         finally:
             rclpy.try_shutdown(context=context)
+
+
+def test_as_a_node_reads_it_at_its_start(exported: Path) -> None:
+    with started_with(exported, "pid_controller") as node:
+        for name in DOUBLES:
+            value = node.get_parameter(f"gains.heater.{name}").value
+            assert isinstance(value, float), name
+        assert node.get_parameter("gains.heater.i").value == pytest.approx(
+            node.get_parameter("gains.heater.p").value / 25.0
+        )
+
+
+def test_controller_node_starts_with_what_is_exported_for_it(tmp_path: Path) -> None:
+    path = tmp_path / "gains.yaml"
+    asked = ("--rule", "imc", "--export", "controller_node", "--command-max", "1e-5")
+    assert main([*MODEL, "--sample-period", "0.5", *asked, "--output", str(path)]) == 0
+    with started_with(path, "any_name") as node:
+        found = {n: p.value for n, p in node.get_parameters_by_prefix("").items()}
+    declared = {entry.name: entry for entry in CONTROLLER_PARAMETERS}
+    given = {name: found[name] for name in found if name in declared}
+    assert set(given) == {"kc", "ti", "td", "tf", "b", "command_max"}
+    assert 25.0 < given["ti"] < 26.0 and given["command_max"] == pytest.approx(1e-5)
+    for name, value in given.items():
+        assert declared[name].problem(value) is None
