@@ -34,6 +34,7 @@ setup(
     python_requires=">=3.11",
     install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11"],
     extras_require={
+        "bags": ["mcap", "pyyaml"],
         "fleet": ["distributed", "pyarrow"],
         "report": ["jinja2", "matplotlib"],
         "web": ["tornado"],
@@ -46,6 +47,7 @@ setup(
             "identifier_node = relay_autotune.start:identifier_node",
             "plant_node = relay_autotune.start:plant_node",
             "controller_node = relay_autotune.start:controller_node",
+            "simulated_loop = relay_autotune.start:simulated_loop",
             "tune_loop = relay_autotune.start:tune_loop",
             "apply_gains = relay_autotune.start:apply_gains",
             "replay = relay_autotune.start:replay",

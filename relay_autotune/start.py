@@ -44,8 +44,31 @@ def start(module: str, told_for: tuple[str, ...] = ()) -> int:
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    status: int = import_module(module).main()
+    try:
+        status: int = import_module(module).main()
+    except ModuleNotFoundError as error:
+        # With pip alone there is no ROS; without its extras, neither what draws nor what records.
+        sys.stderr.write(f"{module.rpartition('.')[2]}: {_lacking(error)}\n")
+        return 1
     return status
+
+
+def _lacking(error: ModuleNotFoundError) -> str:
+    """Return what to install where a package is missing.
+
+    :raises ModuleNotFoundError: if it is one of our own modules, which is a defect.
+    """
+    name = (error.name or "").partition(".")[0]
+    extra = next((extra for extra, names in _EXTRAS.items() if name in names), "")
+    if name in ("", "relay_autotune"):
+        raise error
+    if extra:
+        return f"it needs the Python package {name}: pip install 'relay_autotune[{extra}]'"
+    return f"it needs ROS 2 Jazzy with {name}: `make setup` and `. ./env.sh` in the repository"
+
+
+# The extras of setup.py, with the names under which they are imported.
+_EXTRAS = {"report": ("jinja2", "markupsafe", "matplotlib"), "bags": ("mcap", "yaml")}
 
 
 def command(module: str) -> int:
@@ -64,6 +87,7 @@ relay_node = partial(start, "relay_autotune.nodes.relay")
 identifier_node = partial(start, "relay_autotune.nodes.identifier")
 plant_node = partial(start, "relay_autotune.nodes.plant")
 controller_node = partial(start, "relay_autotune.nodes.controller")
+simulated_loop = partial(start, "relay_autotune.cli.simulated_loop")
 tune_loop = partial(start, "relay_autotune.cli.tune_loop", told_for=("--measurement", "--joint"))
 apply_gains = partial(start, "relay_autotune.cli.apply_gains")
 replay = partial(command, "relay_autotune.cli.replay")

@@ -115,6 +115,9 @@ def guarded(program: str, work: Callable[[], int]) -> int:
         return NOTHING_FOUND
     except KeyboardInterrupt:
         return 130
+    except ModuleNotFoundError:
+        # The start of the executable says what to install.
+        raise
     except Exception as error:
         if os.environ.get(DEBUG):
             raise

@@ -62,7 +62,7 @@ def kind(name: str, package: str) -> Any:
 
 
 def test_every_page_that_shows_how_has_commands() -> None:
-    for name in ("README.md", "docs/quick_start.md", "docs/tutorial.md", "docs/live.md"):
+    for name in ("docs/quick_start.md", "docs/tutorial.md", "docs/live.md"):
         assert len(commands_of(ROOT / name)) >= 10, name
     listed = [words for words in commands_of(ROOT / "docs/quick_start.md") if "--dry-run" in words]
     assert listed, "a command within a numbered list is not seen"
@@ -92,6 +92,17 @@ def test_a_verb_of_ros2_and_its_options_are_known(page: Path) -> None:
             options = {w for w in rest if w.startswith("--")} - {"--params-file"}
             assert options <= VERBS[verb], words
         check_arguments(verb, rest)
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/quick_start.md", "docs/tutorial.md"])
+def test_the_first_pages_need_no_ros2_command(page: str) -> None:
+    """The text may name it beside what does the same; a block would be a dead end without ROS."""
+    shown = every_command_of_blocks(ROOT / page)
+    assert shown and not [words for words in shown if words[0] == "ros2"]
+
+
+def every_command_of_blocks(page: Path) -> list[list[str]]:
+    return parts_of([w for b in blocks("sh", pages=(page,)) for w in commands(b.text)])
 
 
 def check_arguments(verb: str, rest: list[str]) -> None:

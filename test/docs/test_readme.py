@@ -65,7 +65,7 @@ def test_the_lines_of_python_go_from_a_log_to_gains_and_a_figure(
     pytest.importorskip("control")
     monkeypatch.chdir(tmp_path)
     Path("bags").symlink_to(ROOT / "bags")
-    code = block_noted("README.md", "in Python").text
+    code = block_noted("docs/install.md", "in Python").text
     assert len([line for line in code.splitlines() if line]) == 10
     names: dict[str, Any] = {}
     exec(code, names)
@@ -79,7 +79,15 @@ def test_the_lines_of_python_go_from_a_log_to_gains_and_a_figure(
 
 def test_the_demo_shown_is_the_one_computed(capsys: pytest.CaptureFixture[str]) -> None:
     demo._compare(case_of(tune_as_the_demo(), "demo", truth=demo.TRUTH))
-    assert capsys.readouterr().out == block_noted("README.md", "made by the demo").text
+    assert capsys.readouterr().out == block_noted("docs/quick_start.md", "made by the demo").text
+
+
+def test_the_readme_is_one_screen_and_its_session_is_that_of_the_tutorial() -> None:
+    assert len((ROOT / "README.md").read_text().split()) <= 900
+    lines = block_noted("README.md", "tested: lines of the session").text.splitlines()
+    assert set(lines) <= set(
+        block_noted("docs/tutorial.md", "tested: a session").text.splitlines()
+    )
 
 
 def test_the_picture_is_small() -> None:
@@ -109,11 +117,12 @@ def test_make_has_every_target_named() -> None:
         assert set(named) <= targets, page
 
 
-@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])
-def test_colcon_finds_both_packages_in_both_layouts(page: str, tmp_path: Path) -> None:
+def test_colcon_finds_both_packages_in_both_layouts(tmp_path: Path) -> None:
     if not shutil.which("colcon"):
         pytest.skip("colcon is not installed")
-    builds = [words for b in blocks("sh") if b.page == page for words in commands(b.text)]
+    builds = [
+        words for b in blocks("sh") if b.page == "docs/install.md" for words in commands(b.text)
+    ]
     builds = [words for words in builds if words[:2] == ["colcon", "build"]]
     assert len(builds) == 2
     (tmp_path / "src").mkdir()

@@ -33,6 +33,7 @@ FAST = {
 # A controller closes this loop also on a busy machine.
 SLOWER = FAST | {"sample_period": 0.02, "time_constants": [0.4], "dead_time": 0.2}
 TOPICS = ("-r", "measurement:=/tank/level", "-r", "command:=/tank/valve")
+PAGE = "docs/tutorial.md"
 WORDS = (
     "--measurement", "/tank/level", "--command", "/tank/valve", "--within", "30", "50",
     "--at", "2", "--amplitude", "1", "--command-within", "0", "5", "--yes", "--wait", "30",
@@ -80,19 +81,19 @@ def on_screen(written: str) -> str:
     return "\n".join(lines)
 
 
-def test_the_session_of_the_readme_leads_to_proven_gains_and_leaves_nothing_running(
+def test_the_session_of_the_tutorial_leads_to_proven_gains_and_leaves_nothing_running(
     rig: Rig,
 ) -> None:
     heard = rig.listen("/tank/valve", Float64, RELIABLE)
-    (plant,) = commands(block_noted("README.md", "tested: a plant for a session").text)
+    (plant,) = commands(block_noted(PAGE, "tested: a plant for a session").text)
     rig.start("plant_node", *plant[plant.index("--ros-args") + 1 :])
     (call, *_) = (
         words
         for block in blocks("sh")
         for words in commands(block.text)
-        if block.page == "README.md" and "--within" in words
+        if block.page == PAGE and "--within" in words
     )
-    shown = block_noted("README.md", "tested: a session").text
+    shown = block_noted(PAGE, "tested: a session").text
     prompt = re.compile(r"(.*(?:such as .*:|\[y/N\]|such as .*\]|\[none\]:)) (.*)")
     answers = [found[2] for line in shown.splitlines() if (found := prompt.fullmatch(line))]
     assert len(answers) == 5

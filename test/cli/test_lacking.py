@@ -1,0 +1,41 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the executables say where a package is not installed, as with pip alone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+WITHOUT = """
+import sys
+sys.modules.update(dict.fromkeys({0!r}))
+from relay_autotune.start import {1}
+sys.exit({1}())
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "absent", "told"),
+    [
+        ("report", [str(ROOT / "bags/biased_relay"), "-o", "tune.html"], ["jinja2"], "[report]"),
+        ("csv_to_bag", [str(ROOT / "bags/heater.csv"), "bag"], ["yaml"], "[bags]"),
+        ("relay_node", [], ["rclpy"], "make setup"),
+        ("apply_gains", [], ["rclpy"], "make setup"),
+        ("simulated_loop", [], ["rclpy"], "make setup"),
+    ],
+)
+def test_a_missing_package_is_told_in_one_line(name, words, absent, told, tmp_path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT.format(absent, name), *words],
+        cwd=tmp_path, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert absent[0] in done.stderr and told in done.stderr
+    assert "defect" not in done.stderr
