@@ -75,6 +75,11 @@ def _installed(name: str) -> Path:
         ) from None
 
 
+def _require_alive(nodes: OwnNodes) -> None:
+    if lost := nodes.why_lost():
+        raise LoopError(lost)
+
+
 def _serve(nodes: OwnNodes) -> None:
     """Show the loop and take set-points, until Ctrl-C."""
     from std_msgs.msg import Float64
@@ -85,7 +90,7 @@ def _serve(nodes: OwnNodes) -> None:
 
         def now(patience: float) -> float:
             came: list[Float64] = client.heard(Float64, "/measurement", patience, least=1)
-            nodes.require_alive()
+            _require_alive(nodes)
             if not came:
                 raise LoopError("plant_node publishes no measurement")
             return float(came[-1].data)
@@ -93,7 +98,7 @@ def _serve(nodes: OwnNodes) -> None:
         with Working("starting the nodes"):
             began = time.monotonic()
             while not (client.has_publisher("/measurement") and client.has_publisher("/command")):
-                nodes.require_alive()
+                _require_alive(nodes)
                 if time.monotonic() - began > START_WITHIN:
                     raise LoopError(f"the nodes have not started within {START_WITHIN:g} s")
                 client.rest(0.1)
@@ -116,5 +121,5 @@ def _serve(nodes: OwnNodes) -> None:
                 print(f"  {second:2d} s  measurement {now(1.0):.2f} y", flush=True)
         sys.stdout.flush()
         while True:
-            nodes.require_alive()
+            _require_alive(nodes)
             time.sleep(0.5)

@@ -169,8 +169,12 @@ class _Log:
     def info(self, text: str) -> None:
         self._log.info(visible(text))
 
-    def warning(self, text: str) -> None:
-        self._log.warning(visible(text))
+    def warning(self, text: str, throttle_duration_sec: float = 0.0) -> None:
+        # A line of code is throttled always or never.
+        if throttle_duration_sec:
+            self._log.warning(visible(text), throttle_duration_sec=throttle_duration_sec)
+        else:
+            self._log.warning(visible(text))
 
     def error(self, text: str) -> None:
         self._log.error(visible(text))

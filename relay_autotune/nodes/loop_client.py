@@ -411,6 +411,13 @@ class LoopClient:
     def _is_here(self, name: str) -> bool:
         return name.rpartition("/")[0] == self.name.rpartition("/")[0]
 
+    def has_publisher(self, topic: str) -> bool:
+        """Return whether a topic has a publisher.
+
+        :param topic: its full name.
+        """
+        return self._node.count_publishers(topic) > 0
+
     def owners(self, ending: str) -> list[str]:
         """Return the full names of the nodes with a service that has this ending.
 
