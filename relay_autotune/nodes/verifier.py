@@ -306,7 +306,12 @@ class Verifier:
         self._phase = _Phase.SETTLING
         self._until += _TIMES_PLANNED * self._pace() * seconds + _MORE_THAN_PLANNED
         begun, self._advanced = self._recent[-1][0], time.monotonic()
-        while self._phase is _Phase.SETTLING and (done := self._recent[-1][0] - begun) < seconds:
+        # The first sample with the new gains aligns them without a bump: a step before it would be
+        # taken for part of that.
+        while (
+            self._phase is _Phase.SETTLING
+            and not 0.0 < (done := self._recent[-1][0] - begun) >= seconds
+        ):
             self._waits_for = (
                 f"the loop settles with the new gains, {duration(done)} of {duration(seconds)}"
             )

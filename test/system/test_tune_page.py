@@ -65,7 +65,10 @@ def test_a_tune_is_ended_on_any_page_in_each_state_and_a_closed_one_changes_noth
     seen = second.told["elapsed"]
     rig.until(lambda: second.told["elapsed"] > seen + 1.0, "a tune that goes on")
     late = OpenPage(url)
-    rig.until(lambda: late.told and 1.65 in late.samples["command"], "all that was before")
+    # The test begins with a quarter of the amplitude.
+    rig.until(
+        lambda: late.told and any(u != 1.0 for u in late.samples["command"]), "all that was before"
+    )
     assert late.told["status"]
     assert late.told["node"] == "/tank/relay_node"
     late.do("abort")
