@@ -245,8 +245,6 @@ class FitContext:
                 return None
         elif model.dead_time > self.latest[model.process_sign > 0]:
             return None
-        if not self.held and model.dead_time > _LATEST * self.length:
-            return None
         if min(problem.effects(state.coefficients)) < 0.0:
             # Commands may lose their effect on one side, but not act the other way there.
             return None
@@ -387,6 +385,14 @@ class FitContext:
             state = refine_best(problem, thetas, tolerance=TRIAL)
             found.append(self.candidate(problem, state))
         return [c for c in found if c is not None and c.model.process_sign * self.sign < 0]
+
+    def may_be_chosen(self, candidate: Candidate) -> bool:
+        """Return whether a candidate acts in the relay's direction, and not too late to be seen.
+
+        :param candidate: any; further terms may make an earlier one of it.
+        """
+        late = candidate.model.dead_time > _LATEST * self.length
+        return self.sign * candidate.model.process_sign >= 0 and (self.held or not late)
 
     def refit(self, candidate: Candidate, colour: Colour | None, most: int) -> Candidate | None:
         """Fit a candidate in another colour, from where it is.

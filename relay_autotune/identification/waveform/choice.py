@@ -106,7 +106,8 @@ def chosen_fit(problem: Problem, known: Known, sign: int, scale: float, *, held:
     dense = problem.thinned(_MOST_WHITE)
     if found and dense.time.size > few.problem.time.size:
         found = _on_more_samples(replace(few, problem=dense), found)
-    own = [c for c in found if sign * c.model.process_sign >= 0]
+    found = [c for c in found if few.may_be_chosen(c) or sign * c.model.process_sign < 0]
+    own = [c for c in found if few.may_be_chosen(c)]
     if found and sign and not known.structure:
         turned = (few.refit(c, found[0].problem.colour, _STEPS) for c in few.turned())
         found = [*found, *(c for c in turned if c is not None)]
