@@ -8,6 +8,7 @@ import re
 import socket
 import struct
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import product
@@ -170,6 +171,8 @@ def test_no_page_waits_for_the_question_of_another_one(subject):
         def shaped(self, asked):
             while asked.ms == 2.0 and not self.over:
                 self.begun.set()
+                # leaves the processor to the question of the other page
+                time.sleep(0.01)
             return super().shaped(asked)
 
     slow = Slow(subject.case, subject.shaping, subject.first, subject.command)
