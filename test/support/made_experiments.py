@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from relay_autotune.exchange.messages import fill_experiment
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record, RelaySettings
-from relay_autotune_msgs.msg import RelayExperiment
 
 
 def record_of(
@@ -37,6 +35,10 @@ def record_of(
 
 def experiment_of(process: TransferFunction, experiment_id: str, **options: Any) -> Any:
     """Return the message of such an experiment."""
+    # here, since tests of the core use the record above without ROS
+    from relay_autotune.exchange.messages import fill_experiment
+    from relay_autotune_msgs.msg import RelayExperiment
+
     message = RelayExperiment()
     fill_experiment(message, record_of(process, experiment_id, **options))
     return message
