@@ -36,8 +36,6 @@ _OF_NOISE = 1.3
 _OF_SPREAD = 0.02
 # Misfit beyond which a model is of another process.
 _FAR_OFF = 2.0
-# Probability as white noise below which a residual is clearly not white.
-_NOT_WHITE = 1e-6
 
 
 def misfit(found: Identification, record: Record, *, noise: float | None = None) -> float:
@@ -54,20 +52,6 @@ def misfit(found: Identification, record: Record, *, noise: float | None = None)
     allowed = max(_OF_NOISE * known if math.isfinite(known) else 0.0, spread)
     residual = found.fit.residual_rms
     return residual / allowed if allowed > 0.0 else (math.inf if residual > 0.0 else 0.0)
-
-
-def is_contradicted(found: Identification, record: Record) -> bool:
-    """Return whether the residual of a model is clearly not noise.
-
-    Where the noise was not measured, only the residual's correlation shows it.
-
-    :param found: what was identified.
-    :param record: the record.
-    """
-    if not misfit(found, record, noise=0.0) > 1.0:
-        return False
-    measured = math.isfinite(record.noise_std)
-    return (measured and misfit(found, record) > 1.0) or found.fit.whiteness_p < _NOT_WHITE
 
 
 def unexplained_share(found: Identification, record: Record) -> float:

@@ -155,7 +155,6 @@ def _log_ratio(numerator: float, denominator: float, where: str) -> float:
     return math.log(numerator / denominator)
 
 
-_LEAST_CYCLES = 3
 # Standard deviations above an integrator's ratio beyond which noise does not explain a ratio.
 _CERTAIN = 3.0
 _LIKE_AN_INTEGRATOR = (

@@ -44,7 +44,6 @@ from relay_autotune.record.record import Input, Record
 # Number of samples from which even a coarse measurement takes more than two values.
 _ENOUGH_FOR_TWO = 20
 _LEAST_SAMPLES = 12
-_MOST_FOR_CHOICE = 16_384
 # Largest number of samples that are fitted: beyond, noise does not limit what is known.
 _MOST_SAMPLES = 2_000_000
 _OUTLIER = 6.0
