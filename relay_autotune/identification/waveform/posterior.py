@@ -215,6 +215,28 @@ def _apart(halves: Sequence[Part], frequency: float) -> float:
     return 0.5 * float(difference @ np.linalg.pinv(covariance, hermitian=True) @ difference)
 
 
+@dataclass(frozen=True)
+class _Point:
+    """A model in the search for the most likely one, as the samples and the prior see it.
+
+    :param at: coefficients of its numerator, then theta, shape (p,).
+    :param left: its residual, shape (n,).
+    :param jacobian: derivatives of the response, shape (p, n).
+    :param variance: of the noise that the residual shows.
+    :param far: squared distance from the estimate in standard deviations of the prior.
+    """
+
+    at: FloatArray
+    left: FloatArray
+    jacobian: FloatArray
+    variance: float
+    far: float
+
+    def cost(self, variance: float) -> float:
+        """Return minus twice the logarithm of its density, for noise of some variance."""
+        return float(self.left @ self.left) / variance + self.far
+
+
 def _allowed(
     problem: Problem,
     gain: FloatArray,
@@ -243,58 +265,53 @@ def _allowed(
         return (), False
     own = refine(problem, theta, tolerance=TRIAL, most=_STEPS)
 
-    def variance_of(left: FloatArray) -> float:
-        return max(noise(left), NEGLIGIBLE**2)
+    def about(point: FloatArray) -> _Point:
+        left, jacobian = _linearised(problem, point, gain.size)
+        far = float(np.sum(((point - known) / deviation) ** 2))
+        return _Point(point, left, jacobian, max(noise(left), NEGLIGIBLE**2), far)
 
-    def cost_at(point: FloatArray) -> float:
-        left, _ = _linearised(problem, point, gain.size)
-        return float(left @ left) / variance + float(np.sum(((point - known) / deviation) ** 2))
-
-    def axes_at() -> tuple[FloatArray, FloatArray, FloatArray]:
+    def axes_at(point: _Point) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return singular values of the slopes in units of prior and noise, and their axes."""
-        scaled = jacobian * (deviation / math.sqrt(variance))[:, None]
+        scaled = point.jacobian * (deviation / math.sqrt(point.variance))[:, None]
         axes, values, rows = np.linalg.svd(scaled, full_matrices=False)
         return axes, values, rows
 
-    at = known
-    left, jacobian = _linearised(problem, at, gain.size)
-    variance = variance_of(left)
-    cost = cost_at(at)
+    here = start = about(known)
     # The best fit without the prior may be nearer, but also run off where samples tell little.
-    elsewhere = _bounded(np.concatenate((own.coefficients[: gain.size], own.theta)))
-    if cost_at(elsewhere) < cost:
-        at = elsewhere
-        left, jacobian = _linearised(problem, at, gain.size)
-        variance = variance_of(left)
-        cost = cost_at(at)
+    elsewhere = about(_bounded(np.concatenate((own.coefficients[: gain.size], own.theta))))
+    if elsewhere.cost(here.variance) < here.cost(here.variance):
+        here = elsewhere
     for _ in range(_STEPS):
-        axes, values, rows = axes_at()
-        along = values * (rows @ left) / math.sqrt(variance) - axes.T @ ((at - known) / deviation)
+        axes, values, rows = axes_at(here)
+        along = values * (rows @ here.left) / math.sqrt(here.variance)
+        along = along - axes.T @ ((here.at - known) / deviation)
         step = deviation * (axes @ (along / (1.0 + values**2)))
+        cost = here.cost(here.variance)
         for _ in range(_HALVINGS):
-            trial = _bounded(at + step)
-            now = cost_at(trial)
+            trial = about(_bounded(here.at + step))
+            now = trial.cost(here.variance)
             if now < cost:
                 break
             step = 0.5 * step
         else:
             break
-        gained, at = cost - now, trial
-        left, jacobian = _linearised(problem, at, gain.size)
-        variance = variance_of(left)
-        cost = cost_at(at)
-        if gained < _SETTLED * cost:
+        here = trial
+        if cost - now < _SETTLED * here.cost(here.variance):
             break
-    axes, values, _ = axes_at()
+    axes, values, _ = axes_at(here)
     # The symmetric root, which turns on no sign or order of the axes.
     root = (axes / np.sqrt(1.0 + values**2)) @ axes.T
-    farthest = 2.0 * float(gammaincinv(0.5 * at.size, 1.0 - _EXCLUDED))
+    farthest = 2.0 * float(gammaincinv(0.5 * known.size, 1.0 - _EXCLUDED))
+
+    def is_excluded(point: _Point) -> bool:
+        return point.cost(here.variance) - here.cost(here.variance) > farthest
+
     models: list[TransferFunction] = []
     for _ in range(_TRIES * count):
         if len(models) == count:
             break
-        drawn = _bounded(at + deviation * (root @ rng.standard_normal(at.size)))
-        if cost_at(drawn) - cost > farthest:
+        drawn = _bounded(here.at + deviation * (root @ rng.standard_normal(known.size)))
+        if is_excluded(about(drawn)):
             continue
         try:
             model = structure.model_at(drawn[gain.size :], scale * drawn[: gain.size])
@@ -302,7 +319,7 @@ def _allowed(
             continue
         if model is not None:
             models.append(model)
-    return tuple(models), cost_at(known) - cost > farthest
+    return tuple(models), is_excluded(start)
 
 
 def _bounded(point: FloatArray) -> FloatArray:
