@@ -276,7 +276,7 @@ class FitContext:
         """
         found = []
         for terms in self.terms:
-            if all(getattr(candidate.problem, term) not in (False, None) for term in terms):
+            if all(nuisances_of(candidate.problem, terms)):
                 continue
             if "relaxation" in terms and not candidate.structure.factors:
                 # The free state of an integrator is the offset.
@@ -451,9 +451,19 @@ class FitContext:
         return np.array((best.theta[0], 0.0, best.theta[1]))
 
 
-def nuisances_of(problem: Problem) -> tuple[bool, ...]:
-    """Return which of the terms beside the model are estimated."""
-    return tuple(getattr(problem, term) not in (False, None) for term in TERMS)
+def nuisances_of(problem: Problem, terms: Iterable[str] = TERMS) -> tuple[bool, ...]:
+    """Return which of some terms beside the model are estimated."""
+    return tuple(getattr(problem, term) not in (False, None) for term in terms)
+
+
+def as_in(other: Problem, problem: Problem) -> Problem:
+    """Return a problem with the structure and the terms beside the model of another one.
+
+    :param other: has these.
+    :param problem: has the samples and the colour.
+    """
+    terms = {term: getattr(other, term) for term in TERMS}
+    return replace(problem, structure=other.structure, **terms)
 
 
 def with_load(problem: Problem, state: Trial) -> tuple[Problem, Trial]:

@@ -20,10 +20,10 @@ import numpy as np
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.candidates import (
-    TERMS,
     TRIAL,
     Candidate,
     FitContext,
+    as_in,
     drop_first_dead_time,
     nuisances_of,
 )
@@ -136,9 +136,7 @@ def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candid
     again = []
     for c in found:
         if c.score <= found[0].score + _HOPELESS:
-            terms = {term: getattr(c.problem, term) for term in TERMS}
-            problem = replace(context.problem, structure=c.structure, **terms)
-            problem = drop_first_dead_time(problem, c.state)
+            problem = drop_first_dead_time(as_in(c.problem, context.problem), c.state)
             state = refine(problem, c.state.theta, tolerance=TRIAL, most=_STEPS)
             if c is found[0] and _colour(problem, state) is not None:
                 return found
@@ -323,12 +321,7 @@ def _finished(
     if own.colour is not None:
         state = refine(own, candidate.state.theta)
     else:
-        own = replace(
-            problem,
-            structure=own.structure,
-            **{term: getattr(own, term) for term in TERMS},
-        )
-        own = drop_first_dead_time(own, candidate.state)
+        own = drop_first_dead_time(as_in(own, problem), candidate.state)
         state = refine(own, candidate.state.theta)
         if own.time.size > candidate.problem.time.size and _colour(own, state) is not None:
             # Samples so dense are correlated: those that were compared are not.
