@@ -13,6 +13,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -80,20 +81,25 @@ def test_each_benchmark_is_in_one_group_of_the_list() -> None:
     assert sorted(listed) == sorted(runnable)
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", [*QUICK, *LONG])
-def test_it_prints_its_table(name: str) -> None:
-    flags = {**QUICK, **LONG}[name]
+def printed_by(name: str, flags: Sequence[str], within: float) -> str:
+    """Return what a benchmark prints."""
     done = subprocess.run(
         [sys.executable, str(ROOT / "benchmarks" / f"{name}.py"), *flags],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=within,
     )
     assert done.returncode == 0, done.stderr
-    lines = done.stdout.splitlines()
+    return done.stdout
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", [*QUICK, *LONG])
+def test_it_prints_its_table(name: str) -> None:
+    printed = printed_by(name, {**QUICK, **LONG}[name], 120.0)
+    lines = printed.splitlines()
     rules = [k for k, line in enumerate(lines) if re.fullmatch(r"\|(-+\|)+", line)]
-    assert rules, done.stdout
+    assert rules, printed
     for k in rules:
         columns = lines[k].count("|")
         assert lines[k - 1].count("|") - lines[k - 1].count(r"\|") == columns
@@ -126,22 +132,16 @@ def place_on_page(name: str) -> str:
 def test_the_page_is_still_true(name: str) -> None:
     """Half of the speed of a program goes without anybody seeing it."""
     flags, naming = SHORT[name]
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "benchmarks" / f"{name}.py"), *flags],
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert done.returncode == 0, done.stderr
+    printed = printed_by(name, flags, 600.0)
     stated = markdown.figures(place_on_page(name), naming)
-    found = markdown.figures(done.stdout, naming)
-    assert found.keys() & stated.keys(), done.stdout
+    found = markdown.figures(printed, naming)
+    assert found.keys() & stated.keys(), printed
     worse = {
         key: figure.loss(stated[key])
         for key, figure in found.items()
         if key in stated and figure.loss(stated[key]) > MOST_LOSS
     }
-    assert not worse, done.stdout
+    assert not worse, printed
 
 
 def test_a_table_that_is_no_longer_true_is_noticed() -> None:

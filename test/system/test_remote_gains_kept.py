@@ -77,6 +77,21 @@ def test_gains_are_looked_at_before_they_are_sent(rig: Rig) -> None:
     assert loop.values() == BEFORE
 
 
+def at_setpoint(rig: Rig) -> Loop:
+    """Return a loop that goes to the set-point 5."""
+    loop = Loop(rig)
+    setpoint = rig.node.create_publisher(Float64, "setpoint", 10)
+    rig.until(lambda: setpoint.get_subscription_count() == 3, "both controllers")
+    setpoint.publish(Float64(data=5.0))
+    return loop
+
+
+def publish_model(loop: Loop) -> None:
+    model = TransferFunction(final=True, verdict=VERDICT, dead_time=0.1)
+    model.numerator, model.denominator = [2.0], [0.3, 1.0]
+    loop.models.publish(model)
+
+
 def in_a_step(loop: Loop, then: Callable[[], None]) -> None:
     """Verify, and call a function during the step of the set-point."""
     rig = loop.rig
@@ -102,13 +117,8 @@ def in_a_step(loop: Loop, then: Callable[[], None]) -> None:
 def test_the_end_of_the_process_in_a_verification_brings_the_gains_back(
     rig: Rig, number: int
 ) -> None:
-    loop = Loop(rig)
-    setpoint = rig.node.create_publisher(Float64, "setpoint", 10)
-    rig.until(lambda: setpoint.get_subscription_count() == 3, "both controllers")
-    setpoint.publish(Float64(data=5.0))
-    model = TransferFunction(final=True, verdict=VERDICT, dead_time=0.1)
-    model.numerator, model.denominator = [2.0], [0.3, 1.0]
-    loop.models.publish(model)
+    loop = at_setpoint(rig)
+    publish_model(loop)
     offer(loop, "tried", kc=0.5, ti=0.3125)
     assert loop.trigger("apply").success
     assert loop.values() == [0.5, 1.6, 0.0]
@@ -130,14 +140,9 @@ def test_the_end_of_the_process_in_a_verification_brings_the_gains_back(
 def test_a_proof_by_command_that_is_cut_short_leaves_the_gains_of_before(
     rig: Rig, ended: str
 ) -> None:
-    loop = Loop(rig)
-    setpoint = rig.node.create_publisher(Float64, "setpoint", 10)
-    rig.until(lambda: setpoint.get_subscription_count() == 3, "both controllers")
-    setpoint.publish(Float64(data=5.0))
+    loop = at_setpoint(rig)
     process = Process.fopdt(2.0, 0.3, 0.1)
-    model = TransferFunction(final=True, verdict=VERDICT, dead_time=0.1)
-    model.numerator, model.denominator = [2.0], [0.3, 1.0]
-    loop.models.publish(model)
+    publish_model(loop)
     message = PidGains()
     fill_gains(message, design(DesignTask(model=process, options=DesignOptions()), "imc"))
     message.final, message.verdict = True, VERDICT
@@ -160,10 +165,7 @@ def test_a_proof_by_command_that_is_cut_short_leaves_the_gains_of_before(
 
 def test_a_loop_that_falls_silent_in_a_verification_gets_its_gains_back(rig: Rig) -> None:
     """As where a controller of ros2_control is deactivated: its parameters are still there."""
-    loop = Loop(rig)
-    setpoint = rig.node.create_publisher(Float64, "setpoint", 10)
-    rig.until(lambda: setpoint.get_subscription_count() == 3, "both controllers")
-    setpoint.publish(Float64(data=5.0))
+    loop = at_setpoint(rig)
     loop.apply(0.5, 1.6, 2.0)
     rig.run_for(0.5)
     (plant,) = [p for p in rig.processes if p.name == "plant_node"]
