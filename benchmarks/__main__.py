@@ -1,11 +1,11 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run benchmarks, one by its name or a whole group, and put their tables into the guide.
+"""Run benchmarks, one by its name or a whole group, and keep what they print.
 
-    . ./env.sh && python3 benchmarks [NAME or GROUP ...] [--page] [-- FLAGS]
+    . ./env.sh && python3 benchmarks [NAME or GROUP ...] [--keep] [-- FLAGS]
 
-Without names it lists the groups. With --page the tables go to their places in docs/benchmarks.md.
+Without names it lists the groups. With --keep the tables go to benchmarks/results/NAME.md.
 What follows -- goes to each benchmark, such as --quick.
 """
 
@@ -22,7 +22,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-PAGE = HERE.parent / "docs" / "benchmarks.md"
 GROUPS = {
     "identification": (
         *("accuracy", "target_spread", "structure_choice", "coverage", "coloured_noise"),
@@ -49,7 +48,7 @@ GROUPS = {
     "recordings": ("real_recordings", "verdicts"),
 }
 
-_PLACE = re.compile(r"<!-- results of (?P<name>\w+) -->\n.*?<!-- end -->", re.DOTALL)
+_PLACE = re.compile(r"(?<=<!-- results -->\n).*?(?=<!-- end -->)", re.DOTALL)
 
 
 def machine() -> str:
@@ -73,13 +72,12 @@ def listing() -> str:
     return "\n".join(lines)
 
 
-def put_into_page(name: str, block: str) -> bool:
-    """Put the results of a benchmark into its place of the page; return whether it has one."""
-    page = PAGE.read_text()
-    old = next((m[0] for m in _PLACE.finditer(page) if m["name"] == name), None)
-    if old is None:
+def keep(name: str, block: str) -> bool:
+    """Put what a benchmark printed into its file; return whether it has one."""
+    file = HERE / "results" / f"{name}.md"
+    if not file.is_file():
         return False
-    PAGE.write_text(page.replace(old, f"<!-- results of {name} -->\n\n{block}\n\n<!-- end -->"))
+    file.write_text(_PLACE.sub(lambda _: f"\n{block}\n\n", file.read_text()))
     return True
 
 
@@ -90,7 +88,7 @@ def main() -> int:
         own, flags = own[: own.index("--")], own[own.index("--") + 1 :]
     parser = argparse.ArgumentParser(prog="benchmarks", description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help="benchmarks or groups of them")
-    parser.add_argument("--page", action="store_true", help="put the tables into the guide")
+    parser.add_argument("--keep", action="store_true", help="write to benchmarks/results")
     options = parser.parse_args(own)
     if not options.names:
         print(listing())
@@ -108,11 +106,15 @@ def main() -> int:
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
         print(done.stdout)
         status = status or done.returncode
-        if not options.page:
+        if not options.keep:
             continue
         found = done.stdout.strip()
-        if not found or not put_into_page(name, f"{where}\n\n{found}"):
-            why = "the page has no place for it" if found else f"no table, exit {done.returncode}"
+        if not found or not keep(name, f"{where}\n\n{found}"):
+            why = (
+                "benchmarks/results has no file for it"
+                if found
+                else f"no table, exit {done.returncode}"
+            )
             print(f"benchmarks: {name}: {why}", file=sys.stderr)
             status = 1
     return status

@@ -28,6 +28,7 @@ FILES = sorted((ROOT / "benchmarks").glob("[!_]*.py"))
 sys.path.insert(0, str(ROOT / "benchmarks"))
 markdown = importlib.import_module("markdown")
 PAGE = (ROOT / "docs" / "benchmarks.md").read_text()
+RESULTS = ROOT / "benchmarks" / "results"
 QUICK = {
     "fit_time": ("--quick",),
     "accuracy": ("--quick",),
@@ -107,10 +108,33 @@ def test_it_prints_its_table(name: str) -> None:
         assert "nan" not in lines[k + 1]
 
 
-@pytest.mark.parametrize("name", QUICK)
-def test_the_page_has_its_command_and_its_place(name: str) -> None:
-    assert f"python3 benchmarks/{name}.py" in PAGE
-    assert f"<!-- results of {name} -->" in PAGE
+@pytest.mark.parametrize("file", sorted(RESULTS.glob("*.md")), ids=lambda f: f.stem)
+def test_a_file_of_results_has_its_command_and_the_page_links_it(file: Path) -> None:
+    text = file.read_text()
+    assert f"python3 benchmarks/{file.stem}.py" in text
+    assert text.count("<!-- results -->\n") == text.count("<!-- end -->") == 1
+    assert f"benchmarks/results/{file.name})" in PAGE
+
+
+@pytest.mark.parametrize("name", [*QUICK, *LONG])
+def test_a_benchmark_has_a_file_of_results(name: str) -> None:
+    assert (RESULTS / f"{name}.md").is_file()
+
+
+def test_what_is_kept_takes_the_place_of_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(ROOT)
+    runner = importlib.import_module("benchmarks.__main__")
+    monkeypatch.setattr(runner, "HERE", tmp_path)
+    (tmp_path / "results").mkdir()
+    file = tmp_path / "results" / "some.md"
+    file.write_text("# Some\n\n<!-- results -->\n\nold\n\n<!-- end -->\n\nWhat they show.\n")
+    assert runner.keep("some", r"| \1 |")
+    assert file.read_text() == (
+        "# Some\n\n<!-- results -->\n\n| \\1 |\n\n<!-- end -->\n\nWhat they show.\n"
+    )
+    assert not runner.keep("other", "new")
 
 
 # Short forms of those with targets, and the number of columns that name a row of their tables.
@@ -119,21 +143,17 @@ SHORT = {
     "fit_time": (("--quick",), 3),
     "design_time": (("--quick",), 2),
 }
-# How many times worse than on the page a figure may be, for the machine has other work.
+# How many times worse than in the file of results a figure may be, for the machine has other work.
 MOST_LOSS = 2.0
-
-
-def place_on_page(name: str) -> str:
-    return PAGE.split(f"<!-- results of {name} -->")[1].split("<!-- end -->")[0]
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", SHORT)
-def test_the_page_is_still_true(name: str) -> None:
+def test_the_results_are_still_true(name: str) -> None:
     """Half of the speed of a program goes without anybody seeing it."""
     flags, naming = SHORT[name]
     printed = printed_by(name, flags, 600.0)
-    stated = markdown.figures(place_on_page(name), naming)
+    stated = markdown.figures((RESULTS / f"{name}.md").read_text(), naming)
     found = markdown.figures(printed, naming)
     assert found.keys() & stated.keys(), printed
     worse = {

@@ -39,6 +39,7 @@ def test_a_console_shows_what_the_command_prints(
     block: Block, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(ROOT)
+    monkeypatch.setenv("COLUMNS", "100")
     for words, shown in sessions(block.text):
         output, status = run(words, capfd)
         if status:
