@@ -27,6 +27,12 @@ from numpy.typing import NDArray
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.judgement.assessment import integrated_error, validate
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
+from relay_autotune.identification.limit_cycle.shape import (
+    Shape,
+    shape_of_half_cycle,
+    shape_of_record,
+)
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.lags import equal
 from relay_autotune.identification.methods.square_wave import EXACT, FIRST
@@ -37,8 +43,6 @@ from relay_autotune.identification.methods.thyagarajan2003 import (
     fopdt,
     unstable_fopdt,
 )
-from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
-from relay_autotune.identification.shown.shape import Shape, shape_of_half_cycle, shape_of_record
 from relay_autotune.process.simulation import HalfCycle, RelayRun, simulate_relay
 from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction

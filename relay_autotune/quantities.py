@@ -13,8 +13,8 @@ descriptors, command-line flags with their help, and the tables of the guide fol
         def __post_init__(self) -> None:
             check(self, TuningError)
 
-A result declares its fields by :func:`told`; messages, documents and their way back, checks and
-the columns of tables follow from there.
+A result declares its fields by :func:`result_field`; messages, documents, their way back, checks
+and the columns of tables follow from there.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ thirty years."""
 # Longest part of a value that is shown.
 _SHOWN = 60
 _DECLARED = "quantity"
-_TOLD = "told"
+_RESULT = "result_field"
 _Getter = TypeVar("_Getter", bound=Callable[..., float])
 
 
@@ -202,7 +202,7 @@ def check(values: object, error: type[RelayAutotuneError]) -> None:
 
 
 @dataclass(frozen=True)
-class Told:
+class ResultField:
     """A field of a result: what it means, and how documents and messages carry it.
 
     :param name: of the field.
@@ -269,17 +269,17 @@ class Told:
         return f"{text} or NaN" if self.nan else text
 
 
-def told(
+def result_field(
     unit: str = "", default: Any = MISSING, *, nan: bool | None = None, **carried: Any
 ) -> _Field:
-    """Declare the field of a dataclass as one of a result; the arguments are :class:`Told`'s.
+    """Declare the field of a dataclass as one of a result; arguments as for :class:`ResultField`.
 
     :param nan: None: NaN is allowed where it is the default.
     """
     if nan is None:
         nan = isinstance(default, float) and math.isnan(default)
     words = {"unit": unit, "default": default, "nan": nan, **carried}
-    return _Field(default, lambda sentence: {_TOLD: words | {"meaning": sentence}})
+    return _Field(default, lambda sentence: {_RESULT: words | {"meaning": sentence}})
 
 
 def derived(unit: str, *, after: str, column: int = 0) -> Callable[[_Getter], _Getter]:
@@ -289,32 +289,32 @@ def derived(unit: str, *, after: str, column: int = 0) -> Callable[[_Getter], _G
 
     :param unit: of the number.
     :param after: the field that it follows.
-    :param column: as for :class:`Told`.
+    :param column: as for :class:`ResultField`.
     """
 
     def declare(getter: _Getter) -> _Getter:
         meaning = (getter.__doc__ or "").partition("\n")[0]
         words = {"unit": unit, "meaning": meaning, "after": after, "column": column}
-        setattr(getter, _TOLD, words | {"derived": True})
+        setattr(getter, _RESULT, words | {"derived": True})
         return getter
 
     return declare
 
 
 @cache
-def told_fields(kind: Any) -> tuple[Told, ...]:
+def told_fields(kind: Any) -> tuple[ResultField, ...]:
     """Return what a result declares, in the order of documents."""
     types = get_type_hints(kind)
     found = [
-        Told(own.name, types[own.name], **own.metadata[_TOLD])
+        ResultField(own.name, types[own.name], **own.metadata[_RESULT])
         for own in fields(kind)
-        if _TOLD in own.metadata
+        if _RESULT in own.metadata
     ]
     for base in reversed(kind.__mro__):
         for name, member in vars(base).items():
-            words = getattr(getattr(member, "fget", None), _TOLD, None)
+            words = getattr(getattr(member, "fget", None), _RESULT, None)
             if words is not None:
-                found.append(Told(name, float, default=MISSING, **words))
+                found.append(ResultField(name, float, default=MISSING, **words))
     ordered = [each for each in found if each.after is None]
     for each in (each for each in found if each.after is not None):
         names = [before.name for before in ordered]

@@ -6,7 +6,7 @@
 Loading takes most of a second, with nothing to clean up. So Ctrl-C ends the process at once then,
 without a traceback. Python's KeyboardInterrupt would appear in the middle of an import, and some
 callbacks of the import system print and ignore it. Commands enable that exception later
-(`cli.arguments.guarded`), and nodes install their own handlers (`nodes.lifetime.run`).
+(`cli.arguments.run_command`), and nodes install their own handlers (`nodes.lifetime.run`).
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from relay_autotune.errors import ParameterError
-from relay_autotune.quantities import told
+from relay_autotune.quantities import result_field
 from relay_autotune.text import digits
 
 if TYPE_CHECKING:
@@ -106,17 +106,21 @@ class Check:
 class Finding:
     """What one check found."""
 
-    name: str = told().means("Name of the check.")
-    title: str = told().means("Title of the check.")
-    what: str = told().means("The measured quantity.")
-    value: float = told(nan=True, null=math.inf).means("The measured number; NaN: not computed.")
-    unit: str = told().means("Unit of value and limit.")
-    limit: float = told(nan=True, null=math.inf).means(
+    name: str = result_field().means("Name of the check.")
+    title: str = result_field().means("Title of the check.")
+    what: str = result_field().means("The measured quantity.")
+    value: float = result_field(nan=True, null=math.inf).means(
+        "The measured number; NaN: not computed."
+    )
+    unit: str = result_field().means("Unit of value and limit.")
+    limit: float = result_field(nan=True, null=math.inf).means(
         "Largest value of a check that passes; where it failed, of one that does not fail."
     )
-    result: Result = told().means("Result of the check.")
-    sentence: str = told("", "").means("Meaning of a result that did not pass; empty: it passed.")
-    remedy: str = told("", "").means("What to do then.")
+    result: Result = result_field().means("Result of the check.")
+    sentence: str = result_field("", "").means(
+        "Meaning of a result that did not pass; empty: it passed."
+    )
+    remedy: str = result_field("", "").means("What to do then.")
 
     @property
     def said(self) -> str:

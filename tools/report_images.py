@@ -101,12 +101,12 @@ def page_in_browser(found: Analysis) -> None:
 
     from relay_autotune.web.address import Address
     from relay_autotune.web.server import Page, in_background
-    from relay_autotune.web.shape import Asked, Subject
+    from relay_autotune.web.shape import DesignRequest, PageModel
 
     case = case_of(found, "demo_output/bag")
     assert found.shaping is not None
-    first = Asked.of("robust", found.shaping.task.options)
-    subject = Subject(case, found.shaping, first, lambda _: "replay demo_output/bag")
+    first = DesignRequest.of("robust", found.shaping.task.options)
+    subject = PageModel(case, found.shaping, first, lambda _: "replay demo_output/bag")
     page = Page([subject], Address())
     with (
         tempfile.TemporaryDirectory() as folder,

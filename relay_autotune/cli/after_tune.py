@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.apply_gains import found_lines
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, as_typed, deserved, say
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, as_typed, exit_status, say
 from relay_autotune.cli.own_nodes import (
     PROGRAM,
     START_WITHIN,
@@ -198,7 +198,7 @@ class AfterTune:
         complete = result.gains.experiment_id or options.record_only
         written = report or not options.report
         found = client.succeeded and complete and written and proven is not False
-        return deserved(found=found, doubtful=result.verdict == Verdict.DOUBTFUL)
+        return exit_status(found=found, doubtful=result.verdict == Verdict.DOUBTFUL)
 
     def _nothing_started(self) -> int:
         """Print the result of a dry run, or why the node refuses."""

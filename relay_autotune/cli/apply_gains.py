@@ -67,7 +67,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
     given = list(sys.argv[1:] if args is None else args)
     options = _parser().parse_args(given)
-    import relay_autotune.nodes.gains_client  # noqa: F401  see guarded
+    import relay_autotune.nodes.gains_client  # noqa: F401  see run_command
 
     return guarded_in_graph(PROGRAM, lambda graph: _work(options, graph))
 

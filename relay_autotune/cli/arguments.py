@@ -37,7 +37,7 @@ def worst(*statuses: int) -> int:
     return max(statuses, key=_WORSE.index)
 
 
-def deserved(*, found: bool, doubtful: bool) -> int:
+def exit_status(*, found: bool, doubtful: bool) -> int:
     """Return the exit status that a result deserves.
 
     :param found: whether there is what was asked for.
@@ -88,7 +88,7 @@ def say(program: str, text: str) -> None:
     print(told, file=sys.stderr)
 
 
-def guarded(program: str, work: Callable[[], int]) -> int:
+def run_command(program: str, work: Callable[[], int]) -> int:
     """Return the exit status of a command's work; an error becomes one line.
 
     Import what the work needs before: from here on Ctrl-C is an exception, so that files and
@@ -151,14 +151,14 @@ class Graph(ExitStack):
 
 
 def guarded_in_graph(program: str, work: Callable[[ExitStack], int]) -> int:
-    """Return the exit status of a command that talks to nodes, as `guarded`; leave the graph.
+    """Return the exit status of a command that talks to nodes, as `run_command`; leave the graph.
 
     :param program: name of the command.
     :param work: does it, and returns its exit status; the clients that it enters into the stack
         end afterwards.
     """
     with Graph() as graph:
-        status = guarded(program, lambda: work(graph))
+        status = run_command(program, lambda: work(graph))
         if graph.joined:
             # Imported here, because other commands do not need ROS.
             from relay_autotune.nodes.lifetime import LEAVE_WITHIN, end_within

@@ -14,7 +14,7 @@ from pathlib import Path
 from relay_autotune.bag.csv_file import read_csv
 from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
-from relay_autotune.cli.arguments import DONE, finite, guarded, say
+from relay_autotune.cli.arguments import DONE, finite, run_command, say
 from relay_autotune.cli.jobs import add_times
 from relay_autotune.errors import BagError, SelectionError
 
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="time zero of the file [s since 1970-01-01 UTC] (%(default)s)",
     )
     options = parser.parse_args(arguments)
-    return guarded(PROGRAM, lambda: _convert(options))
+    return run_command(PROGRAM, lambda: _convert(options))
 
 
 def _convert(options: argparse.Namespace) -> int:

@@ -25,7 +25,7 @@ from multiprocessing import forkserver, resource_tracker
 from pathlib import Path
 from typing import Any, Self
 
-from relay_autotune.cli.arguments import DONE, deserved, worst
+from relay_autotune.cli.arguments import DONE, exit_status, worst
 from relay_autotune.cli.jobs import Done, Job, died, work
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.exchange.fields import columns
@@ -204,7 +204,7 @@ def _for_spreadsheets(row: dict[str, Any]) -> dict[str, Any]:
 def _status(document: dict[str, Any]) -> int:
     """Return the exit status that a bag deserves, as when it was done."""
     found = document.get("experiments", [])
-    return deserved(
+    return exit_status(
         found=any(e.get("models") and not _contradicted(e) for e in found),
         doubtful=any(e.get("verdict") == "doubtful" for e in found),
     )

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from relay_autotune.cli.arguments import DONE, finite, guarded, with_negative
+from relay_autotune.cli.arguments import DONE, finite, run_command, with_negative
 from relay_autotune.cli.table import identification_lines
 from relay_autotune.cli.terminal import labelled, width
 from relay_autotune.errors import ParameterError, SelectionError, look_up
@@ -23,6 +23,8 @@ from relay_autotune.exchange.document import to_json
 from relay_autotune.exchange.fields import to_document
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
+from relay_autotune.identification.limit_cycle.shape import Shape
 from relay_autotune.identification.methods.atv import atv_from_numbers
 from relay_autotune.identification.methods.chang import chang_from_numbers
 from relay_autotune.identification.methods.li import li_from_numbers
@@ -34,8 +36,6 @@ from relay_autotune.identification.methods.wang import (
     fopdt_with_gain,
 )
 from relay_autotune.identification.result import Identification, identified
-from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
-from relay_autotune.identification.shown.shape import Shape
 from relay_autotune.process.structures import FOPDT
 
 PROGRAM = "identify"
@@ -326,7 +326,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = sys.argv[1:] if arguments is None else arguments
     options = _parser().parse_args(with_negative(given))
-    return guarded(PROGRAM, lambda: _run(options))
+    return run_command(PROGRAM, lambda: _run(options))
 
 
 def _parser() -> argparse.ArgumentParser:

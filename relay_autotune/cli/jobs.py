@@ -27,7 +27,7 @@ from relay_autotune.cli.arguments import (
     USAGE,
     add_quantities,
     as_typed,
-    deserved,
+    exit_status,
     finite,
     given_quantities,
     say,
@@ -49,7 +49,7 @@ from relay_autotune.verdict import Verdict
 if TYPE_CHECKING:
     from relay_autotune.report.case import Case
     from relay_autotune.result import Shaping
-    from relay_autotune.web.shape import Asked
+    from relay_autotune.web.shape import DesignRequest
 
 Progress = Callable[[int, int], None]
 Tell = Callable[[str], None]
@@ -150,7 +150,7 @@ def status_of(analyses: Sequence[Analysis]) -> int:
 
     :param analyses: of its experiments.
     """
-    return deserved(
+    return exit_status(
         found=any(a.models and not a.judgement.contradicted for a in analyses),
         doubtful=any(a.verdict is Verdict.DOUBTFUL for a in analyses),
     )
@@ -473,20 +473,20 @@ def show(
     # Imported here: tornado is for --web alone.
     from relay_autotune.web.address import address_of
     from relay_autotune.web.server import Page, run
-    from relay_autotune.web.shape import Asked, Subject
+    from relay_autotune.web.shape import DesignRequest, PageModel
 
-    rule, target = options.rule or Asked.rule, export_target(options)
+    rule, target = options.rule or DesignRequest.rule, export_target(options)
 
-    def subject(case: Case, shaping: Shaping | None) -> Subject:
-        first = Asked.of(rule, shaping.task.options if shaping else DesignOptions())
+    def subject(case: Case, shaping: Shaping | None) -> PageModel:
+        first = DesignRequest.of(rule, shaping.task.options if shaping else DesignOptions())
 
-        def command(asked: Asked) -> str:
+        def command(asked: DesignRequest) -> str:
             changed = asked.changed_from(first) | ({"law": None} if asked.law == "" else {})
             return as_typed(
                 program, parser, options, web=None, web_address=None, export=None, **changed
             )
 
-        return Subject(case, shaping, first, command)
+        return PageModel(case, shaping, first, command)
 
     subjects = [subject(case, shaping) for case, shaping in models]
 

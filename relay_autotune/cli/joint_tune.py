@@ -45,10 +45,10 @@ from relay_autotune.nodes.ros2_control import (
     ManagedController,
     Opened,
     forwarding,
+    gains_text,
     in_the_way,
     joint_loop,
     put_gains,
-    told,
 )
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune_msgs.action import Tune
@@ -567,7 +567,7 @@ class JointTune:
         put_gains(client, loop.node, wanted, before)
         moved = f"move it by {loop.above[-1]}" if loop.above else "give it a short trajectory"
         for label, text in (
-            ("gains", f"in force, read back: {told(wanted)}; before: {told(before)}"),
+            ("gains", f"in force, read back: {gains_text(wanted)}; before: {gains_text(before)}"),
             (
                 "not verified",
                 f"{loop.why_not_moved}: {moved}, and see in {loop.state_topic} that {loop.joint} "

@@ -12,7 +12,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from relay_autotune.bag.reader import may_be_recording, recordings_in
-from relay_autotune.cli.arguments import DONE, DOUBTFUL, add_web, check_web, guarded, say, worst
+from relay_autotune.cli.arguments import (
+    DONE,
+    DOUBTFUL,
+    add_web,
+    check_web,
+    run_command,
+    say,
+    worst,
+)
 from relay_autotune.cli.jobs import (
     Done,
     Job,
@@ -78,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     options.command_line = command_line(PROGRAM, arguments)
-    return guarded(PROGRAM, lambda: _run(parser, options))
+    return run_command(PROGRAM, lambda: _run(parser, options))
 
 
 def _parser() -> argparse.ArgumentParser:

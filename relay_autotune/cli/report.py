@@ -25,7 +25,7 @@ from relay_autotune.cli.arguments import (
     NOTHING_FOUND,
     finite,
     flag_of,
-    guarded,
+    run_command,
     say,
     typed_as,
 )
@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = _parser().parse_args(arguments)
     options.command_line = command_line(PROGRAM, arguments)
-    return guarded(PROGRAM, lambda: _run(options))
+    return run_command(PROGRAM, lambda: _run(options))
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -16,7 +16,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from relay_autotune.cli.arguments import DONE, guarded
+from relay_autotune.cli.arguments import DONE, run_command
 from relay_autotune.cli.own_nodes import START_WITHIN, OwnNodes
 from relay_autotune.cli.terminal import Help, Working, number_of
 from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError
@@ -30,9 +30,9 @@ _SHOWN = 10
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
     options = _parser().parse_args(args)
-    import relay_autotune.nodes.loop_client  # noqa: F401  see guarded
+    import relay_autotune.nodes.loop_client  # noqa: F401  see run_command
 
-    return guarded(PROGRAM, lambda: _run(options))
+    return run_command(PROGRAM, lambda: _run(options))
 
 
 def _parser() -> argparse.ArgumentParser:

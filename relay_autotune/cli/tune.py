@@ -25,7 +25,7 @@ from relay_autotune.cli.arguments import (
     add_web,
     check_web,
     finite,
-    guarded,
+    run_command,
     say,
     with_negative,
 )
@@ -481,7 +481,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     parser = _parser()
     options = parser.parse_args(with_negative(given))
-    return guarded(PROGRAM, lambda: _run(parser, options))
+    return run_command(PROGRAM, lambda: _run(parser, options))
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -87,7 +87,7 @@ def main(args: Sequence[str] | None = None) -> int:
         print(told, file=sys.stderr, flush=True)
     starts = bool(options.measurement or options.joint)
     with Working("loading what talks to the nodes") if starts else nullcontext():
-        import relay_autotune.nodes.tune_client  # noqa: F401  see guarded
+        import relay_autotune.nodes.tune_client  # noqa: F401  see run_command
 
     return guarded_in_graph(PROGRAM, lambda graph: _tune(options, ros, graph))
 

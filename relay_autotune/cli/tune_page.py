@@ -22,7 +22,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from relay_autotune.cli.apply_gains import verdict_lines
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, deserved, say, worst
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, exit_status, say, worst
 from relay_autotune.cli.own_nodes import PROGRAM
 from relay_autotune.cli.report import analysed_as_there, defaults, flags_of
 from relay_autotune.cli.terminal import WIDEST
@@ -54,9 +54,9 @@ from relay_autotune.report.case import EstimatedQuantity, case_of, model_case
 from relay_autotune.text import digits
 from relay_autotune.verdict import Verdict
 from relay_autotune.web.address import address_of
-from relay_autotune.web.live import APPLY, CHECK, REVERT, START, Live, Wish
+from relay_autotune.web.live import APPLY, CHECK, REVERT, START, Live, PageCommand
 from relay_autotune.web.server import Page, in_background
-from relay_autotune.web.shape import Asked, Subject
+from relay_autotune.web.shape import DesignRequest, PageModel
 from relay_autotune.web.wire import curve, of_running
 from relay_autotune_msgs.msg import PidGains
 
@@ -238,7 +238,7 @@ class _LoopOnPage:
         done = client.succeeded and bool(result.gains.experiment_id)
         live.forget_wishes()
         live.rest("the tune is complete" if done else f"no gains: {result.reason}", good=done)
-        return deserved(found=done, doubtful=result.verdict == Verdict.DOUBTFUL)
+        return exit_status(found=done, doubtful=result.verdict == Verdict.DOUBTFUL)
 
     # The progress of a tune, see `follow`.
 
@@ -327,9 +327,9 @@ class _LoopOnPage:
         bag = result.bag
 
         options = found.shaping.task.options if found.shaping else options_from(values)
-        first = Asked.of(values["rule"], options)
+        first = DesignRequest.of(values["rule"], options)
 
-        def command(asked: Asked) -> str:
+        def command(asked: DesignRequest) -> str:
             if not bag:
                 return ""
             changed = asked.changed_from(first)
@@ -338,7 +338,7 @@ class _LoopOnPage:
 
         case = case_of(found, bag or self._client.name)
         case = replace(case, command=command(first))
-        subject = Subject(case, found.shaping, first, command, self._number)
+        subject = PageModel(case, found.shaping, first, command, self._number)
         self._page.add(subject)
 
 
@@ -434,7 +434,7 @@ class GainsPage:
         self._step = None
         self.look()
 
-    def do(self, wish: Wish) -> None:
+    def do(self, wish: PageCommand) -> None:
         """Do what was wished with the gains in force.
 
         :param wish: to apply, verify or revert.
@@ -451,7 +451,7 @@ class GainsPage:
         live.forget_wishes()
         self.look()
 
-    def _do(self, wish: Wish, controller: GainsClient) -> None:
+    def _do(self, wish: PageCommand, controller: GainsClient) -> None:
         live = self.live
         if wish.what == REVERT:
             live.tell(phase="applying", tone="", status="bringing back the gains before", proof=())
@@ -473,11 +473,11 @@ class GainsPage:
                 controller.allowed_steps(present).require(wish.step)
             self._verify(wish, controller, None)
 
-    def _message(self, wish: Wish) -> Any:
+    def _message(self, wish: PageCommand) -> Any:
         """Return the gains that the page shows as a message."""
         if wish.asked is None or not 0 <= wish.of < len(self.page.subjects):
             raise TuningError("there are no such gains")
-        subject: Subject = self.page.subjects[wish.of]
+        subject: PageModel = self.page.subjects[wish.of]
         if subject.loop != self.number:
             raise TuningError(f"the gains are for another loop than {self.live.told.node}")
         work = self.page.worker.ask(partial(subject.shaped, wish.asked))
@@ -489,7 +489,7 @@ class GainsPage:
         fill_gains(message, gains, experiment_id=subject.case.experiment_id, judgement=judgement)
         return message
 
-    def _verify(self, wish: Wish, controller: GainsClient, new: Controller | None) -> None:
+    def _verify(self, wish: PageCommand, controller: GainsClient, new: Controller | None) -> None:
         live = self.live
         live.tell(phase="verifying", tone="warn", proof=())
         live.show("proof", [])

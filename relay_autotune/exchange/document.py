@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange import models  # noqa: F401  (it says how models are written)
 from relay_autotune.exchange.fields import json_number, of_document, to_document
-from relay_autotune.identification.shown.shape import shape_of_record
+from relay_autotune.identification.limit_cycle.shape import shape_of_record
 from relay_autotune.record.cycles import limit_cycle, settings_of
 from relay_autotune.record.record import Outcome, Record
 from relay_autotune.verdict import NOT_JUDGED, Finding, Judgement, Verdict, verdict_named

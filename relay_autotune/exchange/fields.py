@@ -3,8 +3,8 @@
 
 """Results as documents and as messages, and back, by what their fields declare.
 
-A field is declared once, by :func:`relay_autotune.quantities.told`; what its type means in a
-document and in a message is said here, once for all results.
+A field is declared once, by :func:`relay_autotune.quantities.result_field`; what its type means in
+a document and in a message is said here, once for all results.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.quantities import Told, told_fields
+from relay_autotune.quantities import ResultField, told_fields
 from relay_autotune.text import visible
 
 # Largest relative difference, by rounding, of a number from the one that follows from others.
@@ -160,7 +160,7 @@ def _end(held: Any, which: int) -> Any:
     return (low, high)[which]
 
 
-def _of_json(each: Told, held: Any, part: Any, many: bool, document: dict[str, Any]) -> Any:
+def _of_json(each: ResultField, held: Any, part: Any, many: bool, document: dict[str, Any]) -> Any:
     if part is not None and many:
         return tuple(of_document(part, item) for item in held)
     if part is not None:
@@ -257,7 +257,7 @@ def to_message(message: Any, value: object, prefix: str = "") -> None:
             setattr(message, name, each.kind(held))
 
 
-def _parts(each: Told, prefix: str) -> tuple[tuple[str, str], ...]:
+def _parts(each: ResultField, prefix: str) -> tuple[tuple[str, str], ...]:
     """Return the names in messages of a field's parts, each with the attribute that it holds."""
     if each.kind is complex:
         return (f"{prefix}real", "real"), (f"{prefix}imaginary", "imag")
@@ -308,7 +308,7 @@ def of_message(
 
 
 def _of_field(
-    each: Told, message: Any, error: type[RelayAutotuneError], of: str, prefix: str
+    each: ResultField, message: Any, error: type[RelayAutotuneError], of: str, prefix: str
 ) -> Any:
     name = each.message or prefix + each.name
     held = getattr(message, name)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from relay_autotune.errors import ParameterError
-from relay_autotune.quantities import NORMAL_95, told
+from relay_autotune.quantities import NORMAL_95, result_field
 
 if TYPE_CHECKING:
     from relay_autotune.experiment.experiment import RelayExperiment
@@ -36,11 +36,13 @@ class FitProgress:
     :raises ParameterError: if a number is outside its possible range.
     """
 
-    ultimate_gain: float = told("u/y", math.nan).means("K_u.")
-    ultimate_gain_std: float = told("u/y", math.nan).means("Its standard deviation.")
-    ms: float = told("", math.nan).means("Ms that the gains designed on the model would have.")
-    ms_low: float = told("", math.nan).means("Lower end of its 95 % interval.")
-    ms_high: float = told("", math.nan).means(
+    ultimate_gain: float = result_field("u/y", math.nan).means("K_u.")
+    ultimate_gain_std: float = result_field("u/y", math.nan).means("Its standard deviation.")
+    ms: float = result_field("", math.nan).means(
+        "Ms that the gains designed on the model would have."
+    )
+    ms_low: float = result_field("", math.nan).means("Lower end of its 95 % interval.")
+    ms_high: float = result_field("", math.nan).means(
         "Upper end; inf: some of the loops would be unstable."
     )
 

@@ -21,7 +21,13 @@ from relay_autotune.experiment.faults import (
     why_no_return,
     why_noise_alone,
 )
-from relay_autotune.experiment.relay_law import Patience, Relay, Turns, ample_swing, clear_swing
+from relay_autotune.experiment.relay_law import (
+    DwellFilter,
+    DwellLimit,
+    Relay,
+    ample_swing,
+    clear_swing,
+)
 from relay_autotune.experiment.samples import Run, State
 from relay_autotune.record.cycles import MIN_CYCLES, cycle_from_samples, next_cycle
 from relay_autotune.record.record import Cycle
@@ -114,7 +120,7 @@ class Oscillation:
         self._until_converged = until_converged
         self._on_the_way: deque[tuple[float, bool, bool]] = deque()
         self._switched_at: deque[int] = deque(maxlen=_STAYS + 1)
-        self._turns: Turns
+        self._turns: DwellFilter
         self._limit = first_limit
         self._patient_from = -math.inf
         self._share = math.nan
@@ -222,8 +228,8 @@ class Oscillation:
         self._answered.clear()
         self._long_stays = 0
         self._switches_before = self._run.switches
-        self._patience = Patience(self._levels.balance)
-        self._turns = Turns(t, self._run.response_time)
+        self._patience = DwellLimit(self._levels.balance)
+        self._turns = DwellFilter(t, self._run.response_time)
         self._answers = self._is_lost = False
         # The shortest cycle before a cycle was lost [s]; 0: no cycle was lost.
         self._usual = 0.0
@@ -249,7 +255,7 @@ class Oscillation:
         p = self._parameters
         limit = self._patience.limit
         if self._run.cycles:
-            least = Patience.LEAST_SAMPLES * self._samples.interval
+            least = DwellLimit.LEAST_SAMPLES * self._samples.interval
             limit = max(_PATIENCE_IN_CYCLES * limit, least)
         self._limit = p.max_half_cycle or limit + 2.0 * p.extra_delay
         self._longest_limit = max(self._longest_limit, self._limit)

@@ -63,7 +63,7 @@ class Relay:
         return True
 
 
-class Patience:
+class DwellLimit:
     """How long a relay may stay at one level before the measurement counts as lost.
 
     The limit is :data:`RATIO` times the longest stay so far, or times the time to respond if that
@@ -111,7 +111,7 @@ OVERDUE_SAMPLES = 200
 _MUCH_LONGER = 2.0
 
 
-class Turns:
+class DwellFilter:
     """Separate responses of the process from noise at a switch, by the length of the stays.
 
     After one very long stay (an actuator that sticks for a moment, a load that goes away again),

@@ -14,10 +14,10 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate, Uncertain
-from relay_autotune.identification.shown.fourier import FrequencyPoint
+from relay_autotune.identification.limit_cycle.fourier import FrequencyPoint
 from relay_autotune.process.transfer_function import TransferFunction, process_text
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.quantities import NORMAL_95, told, told_fields
+from relay_autotune.quantities import NORMAL_95, result_field, told_fields
 
 # Largest half interval of a determined value, relative to the value.
 DETERMINED = 0.2
@@ -27,12 +27,14 @@ DETERMINED = 0.2
 class Combination:
     """A combination of parameters with its uncertainty; NaN: not estimated."""
 
-    name: str = told(message="combinations").means("In terms of the parameters.")
-    unit: str = told(message="combination_units").means("Unit of the value.")
-    value: float = told(nan=True).means("Its value.")
-    std: float = told("", math.nan, lower=0.0).means("Its standard deviation.")
-    ci95_low: float = told("", math.nan, document="ci95").means("Lower end of its 95 % interval.")
-    ci95_high: float = told("", math.nan, document="ci95").means("Upper end.")
+    name: str = result_field(message="combinations").means("In terms of the parameters.")
+    unit: str = result_field(message="combination_units").means("Unit of the value.")
+    value: float = result_field(nan=True).means("Its value.")
+    std: float = result_field("", math.nan, lower=0.0).means("Its standard deviation.")
+    ci95_low: float = result_field("", math.nan, document="ci95").means(
+        "Lower end of its 95 % interval."
+    )
+    ci95_high: float = result_field("", math.nan, document="ci95").means("Upper end.")
 
     @property
     def determined(self) -> bool:
@@ -121,15 +123,19 @@ class Validation:
     the noise of the record's curve subtracted.
     """
 
-    period: float = told("", math.nan).means("Difference of the whole period.")
-    period_high: float = told("", math.nan).means("Difference of the time with the command high.")
-    period_low: float = told("", math.nan).means("Difference of the time with the command low.")
-    peak_max: float = told("", math.nan).means("Difference of the highest measurement.")
-    peak_min: float = told("", math.nan).means("Difference of the lowest measurement.")
-    shape: float = told("", math.nan, lower=0.0).means(
+    period: float = result_field("", math.nan).means("Difference of the whole period.")
+    period_high: float = result_field("", math.nan).means(
+        "Difference of the time with the command high."
+    )
+    period_low: float = result_field("", math.nan).means(
+        "Difference of the time with the command low."
+    )
+    peak_max: float = result_field("", math.nan).means("Difference of the highest measurement.")
+    peak_min: float = result_field("", math.nan).means("Difference of the lowest measurement.")
+    shape: float = result_field("", math.nan, lower=0.0).means(
         "Root mean square difference of the two curves."
     )
-    reason: str = told("", "").means("Why there is no limit cycle; empty if there is one.")
+    reason: str = result_field("", "").means("Why there is no limit cycle; empty if there is one.")
 
     @property
     def worst(self) -> float:
@@ -146,23 +152,27 @@ class FitReport:
     ``noise_to_signal`` is N2 of Wang et al. 1997, and ``noise_to_signal_power`` their N1.
     """
 
-    residual_rms: float = told("y", math.nan, lower=0.0, column=2).means(
+    residual_rms: float = result_field("y", math.nan, lower=0.0, column=2).means(
         "Root mean square of measurement minus model."
     )
-    noise_std: float = told("y", math.nan, lower=0.0).means("Noise measured before the test.")
-    fit: float = told("", math.nan, upper=1.0, column=1).means(
+    noise_std: float = result_field("y", math.nan, lower=0.0).means(
+        "Noise measured before the test."
+    )
+    fit: float = result_field("", math.nan, upper=1.0, column=1).means(
         "1 - rms(residual)/rms(measurement about its mean)."
     )
-    whiteness_p: float = told("", math.nan, lower=0.0, upper=1.0).means(
+    whiteness_p: float = result_field("", math.nan, lower=0.0, upper=1.0).means(
         "Probability of a residual this correlated if it were white (Ljung and Box)."
     )
-    prediction: float = told("y", math.nan, lower=0.0).means(
+    prediction: float = result_field("y", math.nan, lower=0.0).means(
         "Root mean square error over the last cycle, predicted from those before."
     )
-    noise_to_signal: float = told("", math.nan, lower=0.0).means(
+    noise_to_signal: float = result_field("", math.nan, lower=0.0).means(
         "mean|residual|/mean|model about the operating point|."
     )
-    noise_to_signal_power: float = told("", math.nan, lower=0.0).means("The same of mean squares.")
+    noise_to_signal_power: float = result_field("", math.nan, lower=0.0).means(
+        "The same of mean squares."
+    )
 
 
 @dataclass(frozen=True)
@@ -193,8 +203,12 @@ class Rival:
     The estimate has a covariance where the support is worth it.
     """
 
-    estimate: Estimate = told().means("The structure's best fit; documents have its model alone.")
-    support: float = told(lower=0.0, upper=1.0).means("Its weight among all structures tried.")
+    estimate: Estimate = result_field().means(
+        "The structure's best fit; documents have its model alone."
+    )
+    support: float = result_field(lower=0.0, upper=1.0).means(
+        "Its weight among all structures tried."
+    )
 
     @property
     def model(self) -> TransferFunction:
@@ -217,51 +231,53 @@ class Identification:
     selected model (Thyagarajan and Yu 2003, eqs 29 and 30).
     """
 
-    method: str = told(word=True, column=1).means("Name in the registry.")
-    estimate: Estimate = told().means("The parameters of the model and their covariance.")
-    ci95_low: FloatArray = told(nan=True, document="ci95").means(
+    method: str = result_field(word=True, column=1).means("Name in the registry.")
+    estimate: Estimate = result_field().means("The parameters of the model and their covariance.")
+    ci95_low: FloatArray = result_field(nan=True, document="ci95").means(
         "Lower ends of the 95 % intervals, shape (p,)."
     )
-    ci95_high: FloatArray = told(nan=True, document="ci95").means("Upper ends, shape (p,).")
-    fit: FitReport = told("", FitReport()).means("Quality of the fit.")
-    validation: Validation | None = told("", None, prefix="validation_").means(
+    ci95_high: FloatArray = result_field(nan=True, document="ci95").means(
+        "Upper ends, shape (p,)."
+    )
+    fit: FitReport = result_field("", FitReport()).means("Quality of the fit.")
+    validation: Validation | None = result_field("", None, prefix="validation_").means(
         "How the limit cycle of the model differs from the record's; None: not compared."
     )
-    integrated_error: float = told("rad/s", math.nan, lower=0.0).means(
+    integrated_error: float = result_field("rad/s", math.nan, lower=0.0).means(
         "Difference from the selected model; NaN: it is that model, or not computed."
     )
-    points: tuple[FrequencyPoint, ...] = told("", (), prefix="point_").means(
+    points: tuple[FrequencyPoint, ...] = result_field("", (), prefix="point_").means(
         "Measured points of the frequency response, by rising frequency."
     )
-    ultimate_gain: float = told("u/y", math.nan, column=1).means(
+    ultimate_gain: float = result_field("u/y", math.nan, column=1).means(
         "K_u with the sign of the process; NaN: the model has none."
     )
-    ultimate_gain_std: float = told("u/y", math.nan, lower=0.0, column=1).means(
+    ultimate_gain_std: float = result_field("u/y", math.nan, lower=0.0, column=1).means(
         "Its standard deviation; NaN: not estimated."
     )
-    ultimate_frequency: float = told("rad/s", math.nan, lower=0.0, column=1).means(
+    ultimate_frequency: float = result_field("rad/s", math.nan, lower=0.0, column=1).means(
         "w_u; NaN: the model has none."
     )
-    ultimate_frequency_std: float = told("rad/s", math.nan, lower=0.0, column=1).means(
+    ultimate_frequency_std: float = result_field("rad/s", math.nan, lower=0.0, column=1).means(
         "Its standard deviation; NaN: not estimated."
     )
-    warnings: tuple[str, ...] = told("", ()).means("Sentences that the user must read.")
-    undetermined: tuple[str, ...] = told("", ()).means(
+    warnings: tuple[str, ...] = result_field("", ()).means("Sentences that the user must read.")
+    undetermined: tuple[str, ...] = result_field("", ()).means(
         "Parameters whose 95 % interval is wider than 20 % of the value."
     )
-    combinations: tuple[Combination, ...] = told("", (), prefix="combination_").means(
+    combinations: tuple[Combination, ...] = result_field("", (), prefix="combination_").means(
         "Where a parameter is not determined, what the data determine all the same."
     )
-    advice: tuple[str, ...] = told("", ()).means(
+    advice: tuple[str, ...] = result_field("", ()).means(
         "Then, what test would determine it, each a sentence."
     )
-    support: float = told("", 1.0, lower=0.0, upper=1.0).means(
+    support: float = result_field("", 1.0, lower=0.0, upper=1.0).means(
         "Weight of this structure among all that were tried; 1: no other was."
     )
-    rivals: tuple[Rival, ...] = told("", (), message=None).means(
+    rivals: tuple[Rival, ...] = result_field("", (), message=None).means(
         "Other structures with some support, the best first."
     )
-    draws: tuple[TransferFunction, ...] = told("", (), message=None, optional=True).means(
+    draws: tuple[TransferFunction, ...] = result_field("", (), message=None, optional=True).means(
         "Models that the record allows, of either direction, each as likely as the others; left "
         "out: the method knows the covariance alone."
     )

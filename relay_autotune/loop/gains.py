@@ -15,7 +15,7 @@ import numpy as np
 from relay_autotune.arrays import ComplexArray
 from relay_autotune.errors import TuningError
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.quantities import check_told, derived, told
+from relay_autotune.quantities import check_told, derived, result_field
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,17 @@ class Controller:
     :raises TuningError: if a value is not finite, kc is zero or a time is negative.
     """
 
-    kc: float = told("u/y", column=1).means("Proportional gain, with the sign of the process.")
-    ti: float = told("s", lower=0.0, column=1).means("Integral time; 0: no integral action.")
-    td: float = told("s", 0.0, lower=0.0, column=1).means("Derivative time.")
-    tf: float = told("s", 0.0, lower=0.0, column=1).means("Time constant of the filter; 0: none.")
-    b: float = told("", 1.0, column=1).means("Set-point weight.")
+    kc: float = result_field("u/y", column=1).means(
+        "Proportional gain, with the sign of the process."
+    )
+    ti: float = result_field("s", lower=0.0, column=1).means(
+        "Integral time; 0: no integral action."
+    )
+    td: float = result_field("s", 0.0, lower=0.0, column=1).means("Derivative time.")
+    tf: float = result_field("s", 0.0, lower=0.0, column=1).means(
+        "Time constant of the filter; 0: none."
+    )
+    b: float = result_field("", 1.0, column=1).means("Set-point weight.")
 
     def __post_init__(self) -> None:
         numbers = (self.kc, self.ti, self.td, self.tf, self.b)
@@ -136,20 +142,22 @@ class Controller:
 class Margins:
     """Margins of a stable loop."""
 
-    ms: float = told(lower=0.0, column=1).means("Largest magnitude of the sensitivity function.")
-    mt: float = told(lower=0.0, column=1).means(
+    ms: float = result_field(lower=0.0, column=1).means(
+        "Largest magnitude of the sensitivity function."
+    )
+    mt: float = result_field(lower=0.0, column=1).means(
         "Largest magnitude of the complementary sensitivity function."
     )
-    gain_margin: float = told(lower=0.0, null=math.inf, column=1).means(
+    gain_margin: float = result_field(lower=0.0, null=math.inf, column=1).means(
         "Factor by which the loop's gain may grow; inf: any."
     )
-    phase_margin: float = told("rad", lower=0.0, null=math.inf, column=1).means(
+    phase_margin: float = result_field("rad", lower=0.0, null=math.inf, column=1).means(
         "Phase that the loop may lose."
     )
-    delay_margin: float = told("s", lower=0.0, null=math.inf, column=1).means(
+    delay_margin: float = result_field("s", lower=0.0, null=math.inf, column=1).means(
         "Dead time that may be added; inf: any."
     )
-    gain_margin_low: float = told("", math.nan, lower=0.0, after="iae_load").means(
+    gain_margin_low: float = result_field("", math.nan, lower=0.0, after="iae_load").means(
         "Factor to which the loop's gain may fall; 0: any. NaN: not computed, here and below."
     )
 
@@ -158,23 +166,23 @@ class Margins:
 class StepFigures:
     """Features of the responses of a loop to unit steps."""
 
-    iae_load: float = told("y s/u", lower=0.0, null=math.inf, column=1).means(
+    iae_load: float = result_field("y s/u", lower=0.0, null=math.inf, column=1).means(
         "Integral of the absolute error after a unit step of the load at the process input; inf: "
         "without integral action."
     )
-    iae_setpoint: float = told("s", math.nan, lower=0.0).means(
+    iae_setpoint: float = result_field("s", math.nan, lower=0.0).means(
         "Integral of the absolute error after a unit step of the set-point."
     )
-    overshoot: float = told("", math.nan, lower=0.0).means(
+    overshoot: float = result_field("", math.nan, lower=0.0).means(
         "After a step of the set-point, relative to it."
     )
-    settling_time: float = told("s", math.nan, lower=0.0).means(
+    settling_time: float = result_field("s", math.nan, lower=0.0).means(
         "Until the measurement stays within 2 % of a new set-point."
     )
-    effort_setpoint: float = told("u/y", math.nan, lower=0.0).means(
+    effort_setpoint: float = result_field("u/y", math.nan, lower=0.0).means(
         "Total variation of the command after a unit step of the set-point."
     )
-    effort_load: float = told("", math.nan, lower=0.0).means(
+    effort_load: float = result_field("", math.nan, lower=0.0).means(
         "Total variation of the command after a unit step of the load."
     )
 
@@ -186,7 +194,7 @@ class Performance(StepFigures, Margins):
     :raises TuningError: if a number is negative, or one that is always computed is NaN.
     """
 
-    noise_gain: float = told("u/y", math.nan, lower=0.0).means(
+    noise_gain: float = result_field("u/y", math.nan, lower=0.0).means(
         "Standard deviation of the command over that of white noise in the samples of the "
         "measurement; without a sampling period the largest gain at any frequency."
     )
@@ -207,23 +215,25 @@ class Gains(Performance, Controller):
     Ms 1.95, gain margin 2.25
     """
 
-    rule: str = told(after="", word=True, column=1).means("Name in the registry.")
-    form: str = told("", "isa", after="rule").means("Form in which the rule is stated.")
-    ms_95: float = told(nan=True, after="ms", column=1).means(
+    rule: str = result_field(after="", word=True, column=1).means("Name in the registry.")
+    form: str = result_field("", "isa", after="rule").means("Form in which the rule is stated.")
+    ms_95: float = result_field(nan=True, after="ms", column=1).means(
         "Ms that 95 % of the models within the uncertainty stay below; NaN: not estimated."
     )
-    law: str = told("", "", word=True, optional=True).means(
+    law: str = result_field("", "", word=True, optional=True).means(
         "Law that they are for; left out: controller_node's, as a continuous controller."
     )
-    law_period: float = told("s", 0.0, lower=0.0, optional=True).means(
+    law_period: float = result_field("s", 0.0, lower=0.0, optional=True).means(
         "Sampling period at which that law runs; left out: no law was named."
     )
-    bare: Performance | None = told("", None, message=None, optional=True).means(
+    bare: Performance | None = result_field("", None, message=None, optional=True).means(
         "What p, i and d do alone, in a controller with neither filter nor set-point weight; left "
         "out: the same, for another law, or an unstable loop."
     )
-    reason: str = told().means("Why this rule and these gains, a sentence for people.")
-    warnings: tuple[str, ...] = told("", ()).means("What the user must know before using them.")
+    reason: str = result_field().means("Why this rule and these gains, a sentence for people.")
+    warnings: tuple[str, ...] = result_field("", ()).means(
+        "What the user must know before using them."
+    )
 
     def __post_init__(self) -> None:
         Controller.__post_init__(self)

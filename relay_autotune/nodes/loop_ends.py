@@ -39,7 +39,7 @@ REPEATS = 15
 CYCLES_KEPT = 100
 
 
-class Outlet:
+class CommandPublisher:
     """A topic on which numbers go out, each in a message of its own.
 
     :param node: the node.
@@ -76,7 +76,7 @@ class Outlet:
         self.last, self.is_fresh = value, True
 
 
-class Ends:
+class RelayTopics:
     """Publishers and subscriptions of relay_node.
 
     :param node: the node.
@@ -112,14 +112,14 @@ class Ends:
         """True if the controller commands the actuator itself and reports how; the relay then
         sends nothing but set-points."""
         # /diagnostics and the answer to a start report an incompatible QoS.
-        self.command = Outlet(
+        self.command = CommandPublisher(
             node, CommandMessage() if self.is_reported else commands, "command", overridable=True
         )
-        self.setpoint: Outlet | None = None
+        self.setpoint: CommandPublisher | None = None
         """Where set-points go out; None: the relay does not move them."""
         if fixed["relay_on"] == "setpoint":
             messages = commands if self.is_reported else CommandMessage()
-            self.setpoint = Outlet(node, messages, "setpoint")
+            self.setpoint = CommandPublisher(node, messages, "setpoint")
         self.relay = self.setpoint or self.command
         """Where the relay's levels go out."""
         self.own = self.relay if self.is_reported else self.command
@@ -173,7 +173,7 @@ _KEPT = 200
 _RETURN_TIME = 5.0
 
 
-class Handover:
+class BumplessTransfer:
     """The present controller's command, and the command to the actuator when no tune runs.
 
     Without a tune, each command of the controller is passed on at once. After a tune, a silence of
@@ -261,7 +261,7 @@ _OWN_KEPT = 256
 _LOOK_EVERY = 0.05
 
 
-class LoopEnds:
+class LoopSupervisor:
     """Watch the other nodes of the loop, and hand the command over and back.
 
     :param node: relay_node.
@@ -269,12 +269,12 @@ class LoopEnds:
     :param stop: ends a running tune; takes the reason.
     """
 
-    def __init__(self, node: Any, ends: Ends, stop: Callable[[str], None]) -> None:
+    def __init__(self, node: Any, ends: RelayTopics, stop: Callable[[str], None]) -> None:
         self._node = node
         self._ends = ends
         self._takeover = takeover = self._value("path") == "takeover"
         self._stop = stop
-        self.handover = Handover(ends.command.send)
+        self.handover = BumplessTransfer(ends.command.send)
         # The actuator is there already; the controller may be elsewhere.
         self.handover.give_back(self._value("initial_command"), self._value("return_time"))
         self.commanded = math.nan

@@ -24,7 +24,7 @@ from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAME
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.procedure import SETTLING_LIMIT, SMALL_CYCLES, how_long
 from relay_autotune.experiment.relay_law import Levels
-from relay_autotune.nodes.loop_ends import Ends, LoopEnds
+from relay_autotune.nodes.loop_ends import LoopSupervisor, RelayTopics
 from relay_autotune.nodes.parameters import merged, values_of
 from relay_autotune.nodes.quality import described, who, why_no_publisher, why_no_subscriber
 from relay_autotune.nodes.tables import TUNE_PARAMETERS
@@ -175,7 +175,9 @@ class Readiness:
     :param loop: the other nodes of the loop.
     """
 
-    def __init__(self, node: Node, ends: Ends, sensor: Sensor, loop: LoopEnds) -> None:
+    def __init__(
+        self, node: Node, ends: RelayTopics, sensor: Sensor, loop: LoopSupervisor
+    ) -> None:
         self._node, self._ends, self._sensor, self._loop = node, ends, sensor, loop
 
     def of(

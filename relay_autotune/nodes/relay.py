@@ -23,7 +23,7 @@ from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.nodes.goals import Narrator, TuneAction, serve
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
-from relay_autotune.nodes.loop_ends import Ends, LoopEnds
+from relay_autotune.nodes.loop_ends import LoopSupervisor, RelayTopics
 from relay_autotune.nodes.parameters import ask_before_changes, declare, values_of
 from relay_autotune.nodes.quality import NO_REPEAT_AFTER, why_no_publisher
 from relay_autotune.nodes.readiness import Checklist, Readiness, Ready, require_settable
@@ -66,7 +66,7 @@ class RelayNode(ServedNode):
         self._reader = reader_of(fixed["measurement_type"], fixed["measurement_field"])
         self._value = self._reader.value
         self._reported = reported_by(fixed)
-        self._ends = Ends(
+        self._ends = RelayTopics(
             self,
             fixed,
             self._reader,
@@ -78,7 +78,7 @@ class RelayNode(ServedNode):
         )
         self._send, self._relay = self._ends.command.send, self._ends.relay.send
         self._on_setpoint = self._ends.setpoint is not None
-        self._loop = LoopEnds(self, self._ends, self._stop_now)
+        self._loop = LoopSupervisor(self, self._ends, self._stop_now)
         self._sensor = Sensor(self, self._reader, repeat=self._on_silence, stop=self._stop_now)
         self._readiness = Readiness(self, self._ends, self._sensor, self._loop)
         self._hear = self._sensor.hear

@@ -716,17 +716,17 @@ def put_gains(
         client.set_values(node, wanted)
         has = client.values(node, tuple(wanted))
         if has != wanted:
-            raise LoopError(f"{node} has {told(has)}, expected {told(wanted)}")
+            raise LoopError(f"{node} has {gains_text(has)}, expected {gains_text(wanted)}")
     except LoopError as error:
         # An answer that is lost need not be a refusal.
         try:
             client.set_values(node, before)
         except LoopError as left:
-            raise LoopError(f"{error}; and {left}: set {told(before)} again") from None
-        raise LoopError(f"{error}; the gains are those of before: {told(before)}") from None
+            raise LoopError(f"{error}; and {left}: set {gains_text(before)} again") from None
+        raise LoopError(f"{error}; the gains are those of before: {gains_text(before)}") from None
 
 
-def told(gains: Mapping[str, float]) -> str:
+def gains_text(gains: Mapping[str, float]) -> str:
     """Return gains in words, by the last part of their parameters."""
     return ", ".join(f"{n.rpartition('.')[2]} {value:.6g}" for n, value in gains.items())
 

@@ -17,14 +17,14 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.errors import RecordError
-from relay_autotune.quantities import told
+from relay_autotune.quantities import result_field
 from relay_autotune.record.record import (
     Cycle,
     CycleFeatures,
     Outcome,
     Record,
     RelaySettings,
-    asked_once,
+    cached_on_record,
 )
 
 # Two commands that differ by less than this part of the command's range are one level.
@@ -61,7 +61,7 @@ class RelayStretch:
     down: IntArray
 
 
-@asked_once
+@cached_on_record
 def find_cycles(record: Record) -> tuple[int, ...]:
     """Return the samples at which cycles begin, from the switches of the command alone.
 
@@ -112,7 +112,7 @@ def infer_settings(record: Record) -> RelaySettings | None:
     )
 
 
-@asked_once
+@cached_on_record
 def settings_of(record: Record) -> RelaySettings | None:
     """Return the relay settings of a record: its own, or else those inferred from its data.
 
@@ -404,7 +404,7 @@ def next_cycle(
     return replace(cycle, converged=agree(window, noise_std, interval, tolerance))
 
 
-@asked_once
+@cached_on_record
 def cycles_of(
     record: Record, *, min_cycles: int = MIN_CYCLES, tolerance: float = TOLERANCE
 ) -> tuple[Cycle, ...]:
@@ -453,8 +453,8 @@ class LimitCycle(CycleFeatures):
 
     # Standard deviation of each of the features between the cycles, by name; 0 for one cycle.
     std: dict[str, float] = field(default_factory=dict)
-    cycles: tuple[int, ...] = told("", ()).means("Indices of the cycles averaged.")
-    converged: bool = told("", False).means("True if they agree.")
+    cycles: tuple[int, ...] = result_field("", ()).means("Indices of the cycles averaged.")
+    converged: bool = result_field("", False).means("True if they agree.")
 
 
 _AVERAGED = tuple(f.name for f in fields(CycleFeatures))

@@ -17,7 +17,7 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import RecordError
-from relay_autotune.quantities import LARGEST, told
+from relay_autotune.quantities import LARGEST, result_field
 
 # Difference of equal slopes, relative to the steepest one.
 _STRAIGHT = 1e-12
@@ -47,7 +47,7 @@ def one_record(given: object, caller: str) -> Record:
     )
 
 
-def asked_once(
+def cached_on_record(
     question: Callable[Concatenate[Record, _P], _T],
 ) -> Callable[Concatenate[Record, _P], _T]:
     """Let a record, which cannot change, remember the answer to a question.
@@ -108,28 +108,28 @@ class RelaySettings:
     ``setpoint + hysteresis`` and high when it falls to ``setpoint - hysteresis``.
     """
 
-    setpoint: float = told("y", nan=True, lower=-LARGEST, upper=LARGEST).means(
+    setpoint: float = result_field("y", nan=True, lower=-LARGEST, upper=LARGEST).means(
         "Measurement about which the relay switches."
     )
-    baseline: float = told("u", lower=-LARGEST, upper=LARGEST).means(
+    baseline: float = result_field("u", lower=-LARGEST, upper=LARGEST).means(
         "Command of the operating point."
     )
-    amplitude: float = told("u", lower=0.0, upper=LARGEST).means(
+    amplitude: float = result_field("u", lower=0.0, upper=LARGEST).means(
         "Half the distance of the two levels, mu."
     )
-    bias: float = told("u", 0.0, lower=-LARGEST, upper=LARGEST).means(
+    bias: float = result_field("u", 0.0, lower=-LARGEST, upper=LARGEST).means(
         "Offset of their middle from the baseline, mu0."
     )
-    hysteresis: float = told("y", 0.0, nan=True, lower=0.0, upper=LARGEST).means(
+    hysteresis: float = result_field("y", 0.0, nan=True, lower=0.0, upper=LARGEST).means(
         "Half width of the switching band, epsilon."
     )
-    extra_delay: float = told("s", 0.0, lower=0.0, upper=LARGEST).means(
+    extra_delay: float = result_field("s", 0.0, lower=0.0, upper=LARGEST).means(
         "Dead time that the relay added."
     )
-    sample_period: float = told("s", 0.0, lower=0.0, upper=LARGEST).means(
+    sample_period: float = result_field("s", 0.0, lower=0.0, upper=LARGEST).means(
         "Nominal period of the samples; 0: by their stamps."
     )
-    reverse_acting: bool = told("", False).means(
+    reverse_acting: bool = result_field("", False).means(
         "True if a higher command lowers the measurement."
     )
 
@@ -151,33 +151,35 @@ class CycleFeatures:
     The times with the command high and low are T_u1 and T_u2 of Wang et al.
     """
 
-    period: float = told("s", nan=True).means("Whole period.")
-    period_high: float = told("s", nan=True).means("Time with the command high.")
-    period_low: float = told("s", nan=True).means("Time with the command low.")
-    peak_max: float = told("y", nan=True).means("Highest measurement, absolute.")
-    peak_min: float = told("y", nan=True).means("Lowest measurement, absolute.")
-    time_to_peak_max: float = told("s", nan=True).means(
+    period: float = result_field("s", nan=True).means("Whole period.")
+    period_high: float = result_field("s", nan=True).means("Time with the command high.")
+    period_low: float = result_field("s", nan=True).means("Time with the command low.")
+    peak_max: float = result_field("y", nan=True).means("Highest measurement, absolute.")
+    peak_min: float = result_field("y", nan=True).means("Lowest measurement, absolute.")
+    time_to_peak_max: float = result_field("s", nan=True).means(
         "From the switch that turns the measurement down to the maximum."
     )
-    time_to_peak_min: float = told("s", nan=True).means(
+    time_to_peak_min: float = result_field("s", nan=True).means(
         "From the switch that turns the measurement up to the minimum."
     )
-    mean_measurement: float = told("y", nan=True, message=None).means(
+    mean_measurement: float = result_field("y", nan=True, message=None).means(
         "Time average of the measurement."
     )
-    mean_command: float = told("u", nan=True, message=None).means("Time average of the command.")
+    mean_command: float = result_field("u", nan=True, message=None).means(
+        "Time average of the command."
+    )
 
 
 @dataclass(frozen=True)
 class Cycle(CycleFeatures):
     """One whole cycle, from a switch to the high level to the next such switch."""
 
-    index: int = told().means("Number of the cycle in its experiment, from 0.")
-    start: float = told("s", message=None).means(
+    index: int = result_field().means("Number of the cycle in its experiment, from 0.")
+    start: float = result_field("s", message=None).means(
         "Time of the switch that begins it, on the record's time axis."
     )
-    converged: bool = told("", False).means("True if it agrees with the cycles before it.")
-    disturbed: bool = told("", False).means("True if it should be left out of averages.")
+    converged: bool = result_field("", False).means("True if it agrees with the cycles before it.")
+    disturbed: bool = result_field("", False).means("True if it should be left out of averages.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,7 +327,7 @@ class Record:
     :param continuous_command: True: the command moved along straight lines between its instants,
         as from an analogue controller; False: it was held.
     :param unthinned: what it was before it was thinned; None: it was not.
-    :ivar answers: answers that the record remembers, see :func:`asked_once`.
+    :ivar answers: answers that the record remembers, see :func:`cached_on_record`.
     :raises RecordError: if shapes differ, a value is not finite or beyond ``LARGEST``, the time
         goes backwards, or the noise is negative.
     """
@@ -410,7 +412,7 @@ class Record:
         return float(self.time[-1] - self.time[0])
 
     @property
-    @asked_once
+    @cached_on_record
     def interval(self) -> float:
         """Median time between samples [s]."""
         return float(np.median(np.diff(self.time)))
@@ -421,7 +423,7 @@ class Record:
         return self.duration / max(len(self) - 1, 1)
 
     @property
-    @asked_once
+    @cached_on_record
     def noise(self) -> float:
         """The noise measured before the test, or else estimated from second differences [y]."""
         return self.noise_std if math.isfinite(self.noise_std) else roughness(self.measurement)
@@ -454,7 +456,7 @@ class Record:
             held_input=held,
         )
 
-    @asked_once
+    @cached_on_record
     def input(self) -> PiecewiseConstant:
         """Return the command at the process, on the clock of the samples.
 

@@ -23,8 +23,8 @@ from relay_autotune.exchange.document import judgement_of_fields
 from relay_autotune.exchange.fields import number, of_document
 from relay_autotune.exchange.models import model_of_fields
 from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.limit_cycle.fourier import FrequencyPoint
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import NORMAL_95

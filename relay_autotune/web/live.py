@@ -23,7 +23,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.exchange.fields import json_number
 from relay_autotune.quantities import check, quantity
 from relay_autotune.report.style import in_steps
-from relay_autotune.web.shape import Asked
+from relay_autotune.web.shape import DesignRequest
 from relay_autotune.web.wire import curve
 
 # Samples of each signal that are kept for a page that is opened late.
@@ -34,7 +34,7 @@ WISHES = (CHECK, START, ABORT, APPLY, VERIFY, REVERT)
 
 
 @dataclass(frozen=True)
-class Wish:
+class PageCommand:
     """What a page wishes.
 
     :raises TuningError: if a value is out of its range.
@@ -42,7 +42,7 @@ class Wish:
 
     what: str = quantity("", choices=WISHES).means("What is to be done.")
     of: int = quantity(0, lower=0).means("Number of the model whose gains are meant.")
-    asked: Asked | None = None
+    asked: DesignRequest | None = None
     """What these gains were asked for by; None: no gains are meant."""
     step: float = quantity(0.0, "y").means("Of the set-point, to verify the gains; 0: none.")
     doubtful: bool = False
@@ -120,7 +120,7 @@ class Live:
         self._is_new = True
         self._signals = {"measurement": _Signal(), "command": _Signal()}
         self._begun = time.monotonic()
-        self._wishes: queue.SimpleQueue[Wish] = queue.SimpleQueue()
+        self._wishes: queue.SimpleQueue[PageCommand] = queue.SimpleQueue()
         self._shown: dict[str, Any] = {}
         self._shown_anew: set[str] = set()
         self.abort = threading.Event()
@@ -173,7 +173,7 @@ class Live:
             self._signals[signal].kept.append(at)
             self._signals[signal].new.append(at)
 
-    def wish(self, wish: Wish) -> None:
+    def wish(self, wish: PageCommand) -> None:
         """Take a wish of a page.
 
         :param wish: during a tune or a verification only its end can be wished.
@@ -183,7 +183,7 @@ class Live:
         elif self.told.phase == "idle":
             self._wishes.put(wish)
 
-    def next_wish(self) -> Wish | None:
+    def next_wish(self) -> PageCommand | None:
         """Return the next wish; None: there is none."""
         try:
             return self._wishes.get_nowait()

@@ -39,8 +39,8 @@ from relay_autotune.tuning import RULES
 from relay_autotune.verdict import Verdict
 from relay_autotune.web import wire
 from relay_autotune.web.address import Address
-from relay_autotune.web.live import Live, Wish
-from relay_autotune.web.shape import Asked, Subject, asked_of
+from relay_autotune.web.live import Live, PageCommand
+from relay_autotune.web.shape import DesignRequest, PageModel, asked_of
 from relay_autotune.web.worker import Worker, yield_to_nodes
 
 _STATIC = ("page.html", "page.css", "page.js", "plot.js", "live.js")
@@ -77,20 +77,20 @@ class Page:
 
     def __init__(
         self,
-        subjects: Sequence[Subject],
+        subjects: Sequence[PageModel],
         address: Address,
         lives: Sequence[Live] = (),
         target: Target | None = None,
     ) -> None:
-        self.subjects: list[Subject] = []
+        self.subjects: list[PageModel] = []
         self.target = target or Target()
         self.address = address
         self.lives = tuple(lives)
         self.computes_ahead = True
         """Whether what the slider may ask for is computed while nothing is asked."""
-        self._known: dict[tuple[int, Asked], str] = {}
-        self._last: dict[int, Asked] = {}
-        self._begun: Counter[tuple[int, Asked]] = Counter()
+        self._known: dict[tuple[int, DesignRequest], str] = {}
+        self._last: dict[int, DesignRequest] = {}
+        self._begun: Counter[tuple[int, DesignRequest]] = Counter()
         self._adding = Lock()
         self.open: set[_Socket] = set()
         """Connections of the pages that are open."""
@@ -102,7 +102,7 @@ class Page:
         for subject in subjects:
             self.add(subject)
 
-    def add(self, subject: Subject) -> None:
+    def add(self, subject: PageModel) -> None:
         """Show another model; what the page shows of it first is computed at once.
 
         :param subject: the model.
@@ -126,7 +126,7 @@ class Page:
                     return partial(self._answer, number, asked)
         return None
 
-    def question(self, number: object, given: object) -> tuple[int, Asked]:
+    def question(self, number: object, given: object) -> tuple[int, DesignRequest]:
         """Return the model and what is asked for, from what a page has sent.
 
         :param number: of the model.
@@ -137,7 +137,7 @@ class Page:
             raise TuningError("there is no such experiment")
         return number, asked_of(given, tuple(RULES))
 
-    def known(self, number: int, asked: Asked) -> str | None:
+    def known(self, number: int, asked: DesignRequest) -> str | None:
         """Return the answer to what a page asks, as JSON; None: it has to be computed.
 
         :param number: of the model.
@@ -147,7 +147,7 @@ class Page:
             self._last[number] = asked
         return self._known.get((number, asked))
 
-    def ask(self, number: int, asked: Asked) -> Future[str]:
+    def ask(self, number: int, asked: DesignRequest) -> Future[str]:
         """Compute the answer to what a page asks.
 
         :param number: of the model.
@@ -155,7 +155,7 @@ class Page:
         """
         return self.worker.ask(partial(self._answer, number, asked))
 
-    def sketch(self, number: int, asked: Asked) -> str | None:
+    def sketch(self, number: int, asked: DesignRequest) -> str | None:
         """Return gains that come near to what is asked for; None: too little is known.
 
         :param number: of the model.
@@ -170,7 +170,7 @@ class Page:
             return None
         return wire.to_text({"sketched": wire.of_shaped(subject, shaped)})
 
-    def _answer(self, number: int, asked: Asked) -> str:
+    def _answer(self, number: int, asked: DesignRequest) -> str:
         known = self._known.get((number, asked))
         if known is not None:
             return known
@@ -185,7 +185,7 @@ class Page:
             told = wire.to_text({"refused": defect(error)})
         return self.keep(number, asked, told)
 
-    def keep(self, number: int, asked: Asked, answer: str) -> str:
+    def keep(self, number: int, asked: DesignRequest, answer: str) -> str:
         """Keep the answer to what a page asks, and return it.
 
         :param number: of the model.
@@ -263,7 +263,7 @@ class _Guarded(RequestHandler):
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.finish(f"{status_code}: {self._reason}\n")
 
-    def subject_and_asked(self) -> tuple[int, Asked]:
+    def subject_and_asked(self) -> tuple[int, DesignRequest]:
         """Return the model and what is asked for, from the request's query."""
         try:
             given = parse_qs(self.request.query, max_num_fields=10)
@@ -350,8 +350,8 @@ class _Socket(_Guarded, WebSocketHandler):
     def open(self, *_: str, **__: str) -> None:
         """Tell the page everything, and from then on what is new."""
         self.set_nodelay(True)
-        self._told: dict[int, tuple[Asked, int]] = {}
-        self._asked: dict[int, Asked] = {}
+        self._told: dict[int, tuple[DesignRequest, int]] = {}
+        self._asked: dict[int, DesignRequest] = {}
         self._waits: asyncio.Task[None] | None = None
         self._present: dict[int, Controller | None] = {}
         self._shown = 0
@@ -410,7 +410,9 @@ class _Socket(_Guarded, WebSocketHandler):
             return
         self._waits = asyncio.create_task(self._sketch_and_answer(head, asked, begun))
 
-    async def _sketch_and_answer(self, head: dict[str, int], asked: Asked, begun: float) -> None:
+    async def _sketch_and_answer(
+        self, head: dict[str, int], asked: DesignRequest, begun: float
+    ) -> None:
         """Tell gains that come near, then the exact ones."""
         # One after the other, since both threads would only hold each other up.
         number = head["of"]
@@ -429,11 +431,11 @@ class _Socket(_Guarded, WebSocketHandler):
         took = round(1000.0 * (time.perf_counter() - begun), 3)
         self.tell(f'{wire.to_text(head | {"took": took})[:-1]},"answer":{answer}}}')
 
-    def _wish(self, question: dict[str, Any]) -> Wish:
+    def _wish(self, question: dict[str, Any]) -> PageCommand:
         of, asked = question.get("of", 0), question.get("asked")
         if not isinstance(of, int):
             raise TuningError("there is no such wish")
-        return Wish(
+        return PageCommand(
             question["do"],
             of,
             None if asked is None else asked_of(asked, tuple(RULES)),

@@ -47,7 +47,7 @@ _FAR = 6.0
 
 
 @dataclass(frozen=True)
-class Asked:
+class DesignRequest:
     """What the page asks of the gains; everything else is as the command line says.
 
     The fields but the rule are those of `DesignOptions`.
@@ -71,7 +71,7 @@ class Asked:
     sample_period: float | None = None
 
     @classmethod
-    def of(cls, rule: str, options: DesignOptions) -> Asked:
+    def of(cls, rule: str, options: DesignOptions) -> DesignRequest:
         """Return what some options ask for.
 
         :param rule: name of the rule.
@@ -92,20 +92,20 @@ class Asked:
         return replace(others, **{"setpoint_weight": math.nan} | given)
 
     @property
-    def apart_from_ms(self) -> Asked:
+    def apart_from_ms(self) -> DesignRequest:
         """The same for all positions of the slider; the weight changes no other gain."""
         return replace(self, ms=FAST, setpoint_weight=None)
 
-    def changed_from(self, first: Asked) -> dict[str, Any]:
+    def changed_from(self, first: DesignRequest) -> dict[str, Any]:
         """Return what differs from what was asked for first, by name.
 
         :param first: as the command line asks.
         """
-        names = (each.name for each in fields(Asked))
+        names = (each.name for each in fields(DesignRequest))
         return {n: getattr(self, n) for n in names if getattr(self, n) != getattr(first, n)}
 
 
-_OPTIONS = tuple(each.name for each in fields(Asked) if each.name != "rule")
+_OPTIONS = tuple(each.name for each in fields(DesignRequest) if each.name != "rule")
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class LoopCurve:
 
 
 @dataclass(frozen=True)
-class Shaped:
+class DesignResult:
     """Gains as they were asked for, and what they do.
 
     :param asked: what was asked for.
@@ -153,7 +153,7 @@ class Shaped:
     :param options: with which they were designed.
     """
 
-    asked: Asked
+    asked: DesignRequest
     gains: Gains
     judgement: Judgement
     steps: Steps
@@ -163,7 +163,7 @@ class Shaped:
 
 
 @dataclass
-class Subject:
+class PageModel:
     """One model of which a page shows all, and for which it shapes gains.
 
     :param case: the experiment as the report shows it.
@@ -175,15 +175,15 @@ class Subject:
 
     case: Case
     shaping: Shaping | None
-    first: Asked
-    command: Callable[[Asked], str]
+    first: DesignRequest
+    command: Callable[[DesignRequest], str]
     loop: int = 0
-    _found: dict[Asked, tuple[Designed, Gains] | TuningError] = field(
+    _found: dict[DesignRequest, tuple[Designed, Gains] | TuningError] = field(
         default_factory=dict, repr=False
     )
     _shown: tuple[float, float] | None = None
 
-    def positions(self, near: Asked) -> Iterator[Asked]:
+    def positions(self, near: DesignRequest) -> Iterator[DesignRequest]:
         """Yield what the slider can ask for: from end to end roughly, then what is near first.
 
         :param near: what was asked for last.
@@ -197,7 +197,7 @@ class Subject:
                     near, rule=DEFAULT_RULE, controller=kind, ms=_ms(k), setpoint_weight=None
                 )
 
-    def trade_off(self, of: Asked) -> list[Gains]:
+    def trade_off(self, of: DesignRequest) -> list[Gains]:
         """Return the controllers of the rule robust that are known so far.
 
         :param of: for the same law, rate and noise.
@@ -212,7 +212,7 @@ class Subject:
             and replace(asked.apart_from_ms, controller="") == wanted
         ]
 
-    def shaped(self, asked: Asked) -> Shaped:
+    def shaped(self, asked: DesignRequest) -> DesignResult:
         """Return gains and what they do.
 
         :param asked: what is asked for.
@@ -227,7 +227,7 @@ class Subject:
             raise TuningError(f"no gains: {judgement.reason}")
         return _shaped(shaping, asked, gains, judgement, self._scale(gains))
 
-    def sketched(self, asked: Asked) -> Shaped | None:
+    def sketched(self, asked: DesignRequest) -> DesignResult | None:
         """Return gains between those that are known for Ms nearby, while the exact ones are found.
 
         They are judged on the model alone, and carry no verdict.
@@ -266,7 +266,7 @@ class Subject:
             return None
         return _shaped(alone, asked, gains, NOT_JUDGED, self._scale(gains))
 
-    def case_with(self, shaped: Shaped) -> Case:
+    def case_with(self, shaped: DesignResult) -> Case:
         """Return the experiment with other recommended gains, as the report shows it.
 
         :param shaped: the gains.
@@ -282,7 +282,7 @@ class Subject:
             command=self.command(shaped.asked),
         )
 
-    def _gains(self, shaping: Shaping, asked: Asked) -> Gains:
+    def _gains(self, shaping: Shaping, asked: DesignRequest) -> Gains:
         """Return the gains; the search is not repeated for another set-point weight."""
         plain = replace(asked, setpoint_weight=None)
         found = self._found.get(plain)
@@ -310,8 +310,12 @@ class Subject:
 
 
 def _shaped(
-    shaping: Shaping, asked: Asked, gains: Gains, judgement: Judgement, scale: tuple[float, float]
-) -> Shaped:
+    shaping: Shaping,
+    asked: DesignRequest,
+    gains: Gains,
+    judgement: Judgement,
+    scale: tuple[float, float],
+) -> DesignResult:
     task = shaping.task
     model = task.in_loop(task.model)
     around: list[TransferFunction] = []
@@ -320,7 +324,7 @@ def _shaped(
         peaks = ensemble_peaks(gains, task.exact)
         unstable = peaks.unstable
         around = [m for m, ms in zip(task.around.models, peaks.ms, strict=True) if ms < math.inf]
-    return Shaped(
+    return DesignResult(
         asked,
         gains,
         judgement,
@@ -368,7 +372,7 @@ def _curve(gains: Gains, model: TransferFunction, shaping: Shaping) -> LoopCurve
     return LoopCurve(values, band)
 
 
-def asked_of(given: object, rules: tuple[str, ...]) -> Asked:
+def asked_of(given: object, rules: tuple[str, ...]) -> DesignRequest:
     """Return what a page asks for, from the fields of its message.
 
     :param given: as JSON was read; what is missing has its default.
@@ -377,10 +381,10 @@ def asked_of(given: object, rules: tuple[str, ...]) -> Asked:
     """
     if not isinstance(given, dict):
         raise TuningError("expected what is asked for as an object of names and values")
-    values = {each.name: given.get(each.name, each.default) for each in fields(Asked)}
+    values = {each.name: given.get(each.name, each.default) for each in fields(DesignRequest)}
     known = {each.name: each for each in declared(DesignOptions)}
     known["rule"] = Quantity("rule", DEFAULT_RULE, choices=rules)
-    for each in fields(Asked):
+    for each in fields(DesignRequest):
         value = values[each.name]
         if value is None and each.default is None:
             continue
@@ -389,4 +393,4 @@ def asked_of(given: object, rules: tuple[str, ...]) -> Asked:
             raise TuningError(problem)
         if known[each.name].is_number:
             values[each.name] = float(value)
-    return Asked(**values)
+    return DesignRequest(**values)

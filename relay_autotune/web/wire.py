@@ -33,7 +33,7 @@ from relay_autotune.report.style import in_steps, thinned
 from relay_autotune.text import digits, visible
 from relay_autotune.tuning.task import DesignOptions
 from relay_autotune.verdict import Verdict
-from relay_autotune.web.shape import CALM, FAST, STEP, Asked, Shaped, Subject
+from relay_autotune.web.shape import CALM, FAST, STEP, DesignRequest, DesignResult, PageModel
 
 # Samples at which the model of a running tune is computed.
 _MOST_SIMULATED = 2000
@@ -70,7 +70,7 @@ def curve(time: ArrayLike, values: ArrayLike) -> list[list[float | None]]:
     return [short(part) for part in thinned(np.asarray(time, float), np.asarray(values, float))]
 
 
-def of_subject(subject: Subject) -> dict[str, Any]:
+def of_subject(subject: PageModel) -> dict[str, Any]:
     """Return what a page shows of a model whatever the gains are.
 
     :param subject: the model.
@@ -145,12 +145,12 @@ def of_present(case: Case) -> list[list[str]]:
     return [list(row) for row in told_of(case.present, performance_of(case.present, case))]
 
 
-def of_asked(asked: Asked) -> dict[str, Any]:
+def of_asked(asked: DesignRequest) -> dict[str, Any]:
     """Return what is asked of the gains, as the page sends it back."""
     return dict(vars(asked))
 
 
-def of_shaped(subject: Subject, shaped: Shaped) -> dict[str, Any]:
+def of_shaped(subject: PageModel, shaped: DesignResult) -> dict[str, Any]:
     """Return gains and what they do.
 
     :param subject: the model.
@@ -203,7 +203,7 @@ def of_shaped(subject: Subject, shaped: Shaped) -> dict[str, Any]:
     }
 
 
-def of_trade_off(subject: Subject, asked: Asked) -> list[list[Any]]:
+def of_trade_off(subject: PageModel, asked: DesignRequest) -> list[list[Any]]:
     """Return Ms and IAE of the controllers that are known so far, each with its kind.
 
     :param subject: the model.
@@ -215,7 +215,7 @@ def of_trade_off(subject: Subject, asked: Asked) -> list[list[Any]]:
     ]
 
 
-def _effects(shaped: Shaped) -> list[list[str]]:
+def _effects(shaped: DesignResult) -> list[list[str]]:
     gains = shaped.gains
     rows = [
         ["Ms", digits(gains.ms, 3), "below 1.4 careful, above 2 risky"],

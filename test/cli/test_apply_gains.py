@@ -24,7 +24,7 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.verifier import without_arrays
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import DesignOptions, DesignTask, design
-from relay_autotune.web.live import APPLY, VERIFY, Wish
+from relay_autotune.web.live import APPLY, VERIFY, PageCommand
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, Verification
 
@@ -192,7 +192,7 @@ def test_the_page_refuses_a_step_beyond_the_limits_before_anything_changes() -> 
     page._message = lambda wish: MESSAGE  # type: ignore[method-assign]
     for what in (VERIFY, APPLY):
         with pytest.raises(TuningError, match=r"is -1.6 y, expected from -1.5 to 2 y"):
-            page._do(Wish(what, step=-1.6), controller)
+            page._do(PageCommand(what, step=-1.6), controller)
     assert not changed
 
 

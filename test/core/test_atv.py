@@ -15,6 +15,7 @@ from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.atv import (
     atv_from_numbers,
@@ -29,7 +30,6 @@ from relay_autotune.identification.methods.lags import (
     with_amplitude,
 )
 from relay_autotune.identification.methods.square_wave import FIRST
-from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import equal_lags
 from relay_autotune.process.transfer_function import TransferFunction

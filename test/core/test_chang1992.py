@@ -17,6 +17,7 @@ from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.chang import chang_from_numbers, identify_chang
 from relay_autotune.identification.methods.lags import equal, solutions, with_amplitude
@@ -29,7 +30,6 @@ from relay_autotune.identification.methods.square_wave import (
     peak,
     slope_sign,
 )
-from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import SOPDT, TWO_EQUAL_ONE
 from relay_autotune.process.transfer_function import TransferFunction

@@ -22,6 +22,7 @@ from relay_autotune.exchange.fields import of_document, of_message, to_document,
 from relay_autotune.exchange.messages import gains_from_message, identification_from_message
 from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.limit_cycle.fourier import FrequencyPoint
 from relay_autotune.identification.result import (
     Combination,
     FitReport,
@@ -29,12 +30,11 @@ from relay_autotune.identification.result import (
     Rival,
     Validation,
 )
-from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.loop.gains import Gains, Performance
 from relay_autotune.process.model_parameters import Quadratic
 from relay_autotune.process.structures import TABLE, Structure
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.quantities import Told, told_fields
+from relay_autotune.quantities import ResultField, told_fields
 from relay_autotune.record.cycles import LimitCycle
 from relay_autotune.record.record import Cycle, RelaySettings
 from relay_autotune.verdict import Finding, Judgement, Result
@@ -55,7 +55,7 @@ TEXTS = st.text(max_size=5).filter(str.isprintable)
 WORDS = st.text(string.ascii_lowercase, min_size=1, max_size=5)
 
 
-def numbers(each: Told) -> st.SearchStrategy[float]:
+def numbers(each: ResultField) -> st.SearchStrategy[float]:
     low, high = max(each.lower, -1e6), min(each.upper, 1e6)
     inside = st.floats(low, high, allow_nan=False)
     extra = [math.inf] if math.isinf(each.null) else []

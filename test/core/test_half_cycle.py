@@ -13,9 +13,9 @@ from sampled_relay import exact_limit_cycle
 from worked_cases import cases
 
 from relay_autotune.errors import ModelError
+from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
+from relay_autotune.identification.limit_cycle.shape import normalised_growth
 from relay_autotune.identification.methods.lags import equal
-from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
-from relay_autotune.identification.shown.shape import normalised_growth
 from relay_autotune.process.simulation import HalfCycle, simulate_relay
 from relay_autotune.process.structures import INTEGRATOR_INVERSE, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction

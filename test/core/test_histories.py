@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.experiment.oscillation import MOST_BORNE
-from relay_autotune.experiment.relay_law import OVERDUE, Turns
+from relay_autotune.experiment.relay_law import OVERDUE, DwellFilter
 from relay_autotune.experiment.samples import GAP, Samples
 from relay_autotune.record.record import Outcome
 
@@ -169,8 +169,8 @@ def test_stays_that_are_too_unlike_for_a_cycle_are_counted_all_the_same():
 
 def test_whatever_is_counted_it_lasts_no_longer_than_its_parts(monkeypatch):
     # Let the count of cycles be lost altogether.
-    monkeypatch.setattr(Turns, "add", lambda *_, **__: False)
-    monkeypatch.setattr(Turns, "is_overdue", lambda *_: False)
+    monkeypatch.setattr(DwellFilter, "add", lambda *_, **__: False)
+    monkeypatch.setattr(DwellFilter, "is_overdue", lambda *_: False)
     tune = disturbed(9e9, 0.0, kind="load", samples=60_000)
     assert tune.outcome is Outcome.FAILED
     assert "longer than its parts may take" in tune.reason

@@ -14,6 +14,7 @@ from sampled_relay import exact_limit_cycle
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.methods import JOINT_METHODS, identify, identify_jointly
 from relay_autotune.identification.methods.lags import MODEL_1, MODEL_4, MODEL_5
 from relay_autotune.identification.methods.li import (
@@ -22,7 +23,6 @@ from relay_autotune.identification.methods.li import (
     fits_jointly,
     li_from_numbers,
 )
-from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import equal_lags
 from relay_autotune.process.transfer_function import TransferFunction

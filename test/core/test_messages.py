@@ -30,8 +30,8 @@ from relay_autotune.exchange.messages import (
     without_impossible,
 )
 from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.limit_cycle.fourier import FrequencyPoint
 from relay_autotune.identification.result import Combination, FitReport, Identification, Validation
-from relay_autotune.identification.shown.fourier import FrequencyPoint
 from relay_autotune.loop.gains import Gains
 from relay_autotune.process.structures import IPDT, UNSTABLE_FOPDT, GivenModel
 from relay_autotune.process.transfer_function import TransferFunction

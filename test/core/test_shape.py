@@ -14,8 +14,8 @@ from sampled_relay import exact_limit_cycle, simulate_sampled_relay
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.shown.fold import fold
-from relay_autotune.identification.shown.shape import (
+from relay_autotune.identification.limit_cycle.fold import fold
+from relay_autotune.identification.limit_cycle.shape import (
     Envelope,
     Shape,
     curvature_time,

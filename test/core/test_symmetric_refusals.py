@@ -16,10 +16,10 @@ from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.atv import atv_from_numbers
 from relay_autotune.identification.methods.chang import chang_from_numbers, identify_chang
-from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 

@@ -16,6 +16,8 @@ from sampled_relay import exact_limit_cycle
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
+from relay_autotune.identification.limit_cycle.shape import shape_of_half_cycle
 from relay_autotune.identification.methods.lags import equal
 from relay_autotune.identification.methods.square_wave import EXACT, FIRST, Wave
 from relay_autotune.identification.methods.thyagarajan2003 import (
@@ -26,8 +28,6 @@ from relay_autotune.identification.methods.thyagarajan2003 import (
     rise_time_constant,
     unstable_fopdt,
 )
-from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
-from relay_autotune.identification.shown.shape import shape_of_half_cycle
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction

@@ -14,7 +14,7 @@ from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.judgement.assessment import integrated_error, validate
-from relay_autotune.identification.shown.fold import fold
+from relay_autotune.identification.limit_cycle.fold import fold
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import INTEGRATOR_INVERSE, UNSTABLE_FOPDT, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
@@ -100,8 +100,8 @@ def test_a_wrong_model_does_not(wrong):
 
 
 def test_models_of_one_period_and_amplitude_differ_in_shape_only():
+    from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
     from relay_autotune.identification.methods.lags import equal
-    from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 
     relay = RelaySettings(0.0, 0.0, 1.0, 0.0, 0.1)
     run = simulate_relay(FOPDT, relay, cycles=6)

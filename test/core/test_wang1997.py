@@ -15,6 +15,7 @@ from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.limit_cycle.fourier import cycle_means, frequency_point
 from relay_autotune.identification.methods.wang import (
     FopdtCycle,
     fopdt_from_biased,
@@ -23,7 +24,6 @@ from relay_autotune.identification.methods.wang import (
     identify_biased,
     identify_unbiased,
 )
-from relay_autotune.identification.shown.fourier import cycle_means, frequency_point
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import IPDT
 from relay_autotune.process.transfer_function import TransferFunction

@@ -25,7 +25,7 @@ from relay_autotune.tuning import DesignOptions
 from relay_autotune.web.address import Address
 from relay_autotune.web.live import Live
 from relay_autotune.web.server import Page, in_background
-from relay_autotune.web.shape import Asked, Subject
+from relay_autotune.web.shape import DesignRequest, PageModel
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 HOSTILE = "<img src=x onerror=\"document.title='taken'\"><script>document.title='taken'</script>"
@@ -38,22 +38,22 @@ def analysed(name: str = "unbiased_relay_with_noise") -> Analysis:
     return analysed_once(record)
 
 
-def subject_of(analysis: Analysis, name: str = "a bag") -> Subject:
+def subject_of(analysis: Analysis, name: str = "a bag") -> PageModel:
     """Return what a page shows of an analysis."""
     shaping = analysis.shaping
-    first = Asked.of("robust", shaping.task.options if shaping else DesignOptions())
-    return Subject(case_of(analysis, name), shaping, first, lambda a: f"replay {a.ms}")
+    first = DesignRequest.of("robust", shaping.task.options if shaping else DesignOptions())
+    return PageModel(case_of(analysis, name), shaping, first, lambda a: f"replay {a.ms}")
 
 
-def hostile(subject: Subject) -> Subject:
+def hostile(subject: PageModel) -> PageModel:
     """Return the subject with markup for its name and its reason."""
     case = replace(subject.case, source=HOSTILE, reason=HOSTILE)
-    return Subject(case, subject.shaping, subject.first, lambda _: HOSTILE)
+    return PageModel(case, subject.shaping, subject.first, lambda _: HOSTILE)
 
 
 @contextmanager
 def served(
-    subjects: list[Subject],
+    subjects: list[PageModel],
     address: Address | None = None,
     *,
     ahead: bool = False,

@@ -53,7 +53,7 @@ def test_apply_gains_without_a_controller_node_says_how_to_start_one(idle: Rig) 
     ) in done.stderr
 
 
-class Ends:
+class RelayTopics:
     """Sensor and actuator of the loop, made by the test's node."""
 
     def __init__(
@@ -87,7 +87,7 @@ class Ends:
         self.publisher.publish(self.kind(data=self.value(self.count)))
         self.count += 1
 
-    def __enter__(self) -> Ends:
+    def __enter__(self) -> RelayTopics:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -111,23 +111,23 @@ def refused(rig: Rig, said: str, **request: Any) -> str:
 
 
 def test_no_measurement_arriving(idle: Rig) -> None:
-    with Ends(idle, measurement=None):
+    with RelayTopics(idle, measurement=None):
         reason = refused(idle, "no measurement has come yet: /measurement has no publisher")
         assert "\n" not in reason
 
 
 def test_a_measurement_of_another_type(idle: Rig) -> None:
-    with Ends(idle, measurement=(Float32, RELIABLE)):
+    with RelayTopics(idle, measurement=(Float32, RELIABLE)):
         refused(idle, "/onlooker has type std_msgs/msg/Float32, expected std_msgs/msg/Float64")
 
 
 def test_no_subscriber_on_the_command(idle: Rig) -> None:
-    with Ends(idle, command=None):
+    with RelayTopics(idle, command=None):
         refused(idle, "no command would arrive: /command has no subscriber")
 
 
 def test_a_command_subscriber_with_incompatible_qos(idle: Rig) -> None:
-    with Ends(idle, command=(Float64, LATCHED_ONLY)):
+    with RelayTopics(idle, command=(Float64, LATCHED_ONLY)):
         reason = refused(idle, "/onlooker has an incompatible QoS")
         assert "transient local" in reason.lower()
 
@@ -142,7 +142,7 @@ def test_a_command_subscriber_with_incompatible_qos(idle: Rig) -> None:
     ],
 )
 def test_an_amplitude_that_cannot_be(idle: Rig, amplitude: float, said: str) -> None:
-    with Ends(idle):
+    with RelayTopics(idle):
         refused(idle, said, amplitude=amplitude)
 
 
@@ -172,7 +172,7 @@ def test_a_parameter_out_of_range(idle: Rig, name: str, value: float) -> None:
 
 def test_an_unknown_baseline(idle: Rig) -> None:
     assert set_parameter(idle, "baseline", math.nan).successful
-    with Ends(idle):
+    with RelayTopics(idle):
         refused(idle, "the baseline is not known")
         assert set_parameter(idle, "baseline", -2.0).successful
         reason = refused(idle, "is at the actuator's end, command_min -2", amplitude=0.5)
@@ -183,7 +183,7 @@ def test_an_unknown_baseline(idle: Rig) -> None:
 
 
 def test_a_dry_run_says_what_would_be_done_and_moves_nothing(idle: Rig) -> None:
-    with Ends(idle) as ends:
+    with RelayTopics(idle) as ends:
 
         def accepted() -> Any:
             answer = idle.ask_for_tune(dry_run=True)
@@ -255,7 +255,7 @@ def test_a_misspelt_name_in_a_file_is_told(rig: Rig) -> None:
 def test_a_measurement_that_is_no_number_ends_the_tune(rig: Rig, bad: float) -> None:
     experiments = rig.listen("relay_experiment", RelayExperiment)
     relay = rig.relay(amplitude=1.0, baseline=0.5)
-    with Ends(rig, value=lambda k: math.sin(0.1 * k)) as ends:
+    with RelayTopics(rig, value=lambda k: math.sin(0.1 * k)) as ends:
         answer = rig.tune()
         rig.until(lambda: len(ends.commands) > 50, "commands")
         ends.value = lambda _: bad
@@ -273,7 +273,7 @@ def test_a_constant_measurement_ends_the_tune(rig: Rig) -> None:
     gains = rig.listen("pi_gains", PidGains)
     rig.relay(amplitude=1.0, baseline=0.5, max_duration=1.5, settle_time=0.3)
     rig.identifier()
-    with Ends(rig, value=lambda _: 20.0) as ends:
+    with RelayTopics(rig, value=lambda _: 20.0) as ends:
         rig.tune()
         ended = rig.until(lambda: experiments, "the record")[-1]
         rig.until(lambda: ends.commands[-1].data == 0.5, "the safe command")
@@ -285,7 +285,7 @@ def test_a_constant_measurement_ends_the_tune(rig: Rig) -> None:
 
 def test_while_a_tune_runs(rig: Rig) -> None:
     relay = rig.relay(amplitude=1.0, baseline=0.5, settle_time=60.0)
-    with Ends(rig):
+    with RelayTopics(rig):
         first = rig.tune()
         second = rig.ask_for_tune()
         assert not second.accepted
@@ -298,7 +298,7 @@ def test_while_a_tune_runs(rig: Rig) -> None:
 
 def test_a_best_effort_sensor_is_taken_as_it_comes(rig: Rig) -> None:
     relay = rig.relay(amplitude=1.0, baseline=0.5, settle_time=60.0)
-    with Ends(rig, measurement=(Float64, BEST_EFFORT)):
+    with RelayTopics(rig, measurement=(Float64, BEST_EFFORT)):
         assert rig.tune(dry_run=True).accepted
         said = "/measurement is taken best effort, as "
         rig.until(lambda: said in relay.log, said)
@@ -312,7 +312,7 @@ def test_a_best_effort_sensor_is_taken_as_it_comes(rig: Rig) -> None:
 def test_a_reliability_that_the_user_gives_is_kept(rig: Rig) -> None:
     override = "qos_overrides./measurement.subscription.reliability"
     rig.relay(amplitude=1.0, baseline=0.5, **{override: "reliable"})
-    with Ends(rig, measurement=(Float64, BEST_EFFORT)):
+    with RelayTopics(rig, measurement=(Float64, BEST_EFFORT)):
         reason = refused(rig, "/onlooker has an incompatible QoS")
         assert "reliab" in reason.lower()
 
@@ -322,7 +322,7 @@ def test_a_wrong_topic_is_told_with_the_nearest_of_its_type(idle: Rig) -> None:
     level = idle.node.create_publisher(Float64, "/other", RELIABLE)
     fan = idle.node.create_publisher(Float32, "/fan/measurement", RELIABLE)
     try:
-        with Ends(idle, measurement=None):
+        with RelayTopics(idle, measurement=None):
             reason = refused(idle, "start the node with -r measurement:=/tank/measurement")
             reason = refused(idle, "(others: /other)")
             assert "/fan" not in reason

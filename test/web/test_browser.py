@@ -11,7 +11,7 @@ from chromium import Chromium
 from served import HOSTILE, hostile, served
 
 from relay_autotune.web.address import Address
-from relay_autotune.web.shape import Asked
+from relay_autotune.web.shape import DesignRequest
 
 pytestmark = pytest.mark.browser
 TAB, RIGHT, SPACE = ("Tab", 9), ("ArrowRight", 39), (" ", 32)
@@ -33,13 +33,13 @@ def curve(tab, plot: str) -> str:
     return tab.eval(f"document.querySelector('#{plot} .curve').getAttribute('d')")
 
 
-def told(subject, asked: Asked) -> str:
+def told(subject, asked: DesignRequest) -> str:
     return f"kc {subject.shaped(asked).gains.kc:.4f}"
 
 
 def test_the_slider_by_keyboard_alone_and_a_page_that_is_loaded_again(browser, url, subject):
     tab = browser.tab(url)
-    assert shown(tab).startswith(told(subject, Asked()))
+    assert shown(tab).startswith(told(subject, DesignRequest()))
     before = [curve(tab, name) for name in ("plot-measurement", "plot-command", "plot-nyquist")]
     for _ in range(30):
         tab.press(*TAB)
@@ -48,7 +48,7 @@ def test_the_slider_by_keyboard_alone_and_a_page_that_is_loaded_again(browser, u
     assert tab.eval("document.activeElement.id") == "ms"
     for _ in range(5):
         tab.press(*RIGHT)
-    expected = told(subject, Asked(ms=1.5))
+    expected = told(subject, DesignRequest(ms=1.5))
     tab.until(lambda: shown(tab).startswith(expected), expected)
     assert tab.text("#ms-value") == "1.50"
     assert tab.text("#command") == "replay 1.5"
@@ -63,7 +63,7 @@ def test_kinds_rules_and_weight_by_mouse(browser, url, subject):
     tab = browser.tab(url)
     shown(tab)
     tab.click("input[value=pi]")
-    expected = told(subject, Asked(controller="pi"))
+    expected = told(subject, DesignRequest(controller="pi"))
     tab.until(lambda: shown(tab).startswith(expected), expected)
     tab.click("#own-weight")
     tab.eval("weight = document.querySelector('#weight'), weight.value = 0.2,"
@@ -71,7 +71,7 @@ def test_kinds_rules_and_weight_by_mouse(browser, url, subject):
     tab.until(lambda: "b 0.2000" in shown(tab), "the weight")
     tab.eval("rule = document.querySelector('#rule'), rule.value = 'simc',"
              "rule.dispatchEvent(new Event('change'))")  # fmt: skip
-    expected = told(subject, Asked("simc", "pi"))
+    expected = told(subject, DesignRequest("simc", "pi"))
     tab.until(lambda: shown(tab).startswith(expected), expected)
     assert tab.eval("document.querySelectorAll('.mark.chosen').length") == 1
     tab.eval("law = document.querySelector('#law'), law.value = 'pid_controller',"
@@ -83,14 +83,14 @@ def test_kinds_rules_and_weight_by_mouse(browser, url, subject):
 
 def test_two_pages_do_not_disturb_each_other(browser, url, subject):
     first, second = browser.tab(url), browser.tab(f"{url}#ms=1.7&controller=pi&rule=robust")
-    expected = told(subject, Asked(controller="pi", ms=1.7))
+    expected = told(subject, DesignRequest(controller="pi", ms=1.7))
     second.until(lambda: shown(second).startswith(expected), expected)
-    assert shown(first).startswith(told(subject, Asked()))
+    assert shown(first).startswith(told(subject, DesignRequest()))
 
 
 def test_an_address_with_impossible_wishes_shows_the_first_gains(browser, url, subject):
     tab = browser.tab(f"{url}#ms=-7&controller=%3Cb%3E&rule=os.system&setpoint_weight=x")
-    assert shown(tab).startswith(told(subject, Asked()))
+    assert shown(tab).startswith(told(subject, DesignRequest()))
 
 
 def test_hostile_names_are_text(browser, subject):

@@ -16,11 +16,11 @@ from relay_autotune.errors import TuningError
 from relay_autotune.exchange.messages import gains_from_message
 from relay_autotune.record.record import Outcome
 from relay_autotune.verdict import Judgement
-from relay_autotune.web.live import Live, Wish
-from relay_autotune.web.shape import Asked
+from relay_autotune.web.live import Live, PageCommand
+from relay_autotune.web.shape import DesignRequest
 from relay_autotune_msgs.msg import PidGains
 
-CALM = Wish("apply", 0, Asked(controller="pi", ms=1.3), 0.0)
+CALM = PageCommand("apply", 0, DesignRequest(controller="pi", ms=1.3), 0.0)
 
 
 def sent(subject, wish):
@@ -67,7 +67,7 @@ def test_an_experiment_that_was_aborted_has_no_gains_to_send():
         sent(subject_of(analysed_once(aborted)), replace(CALM, doubtful=True))
 
 
-@pytest.mark.parametrize("wish", [replace(CALM, of=1), Wish("apply")])
+@pytest.mark.parametrize("wish", [replace(CALM, of=1), PageCommand("apply")])
 def test_gains_that_are_not_there_are_not_sent(wish):
     with pytest.raises(TuningError, match="no such gains"):
         sent(subject_of(analysed()), wish)

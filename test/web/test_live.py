@@ -16,7 +16,7 @@ from tornado.websocket import websocket_connect
 
 from relay_autotune.report.case import model_case
 from relay_autotune.web import live as live_module
-from relay_autotune.web.live import Live, Wish
+from relay_autotune.web.live import Live, PageCommand
 from relay_autotune.web.wire import of_running
 
 
@@ -93,13 +93,13 @@ def test_five_pages_are_told_the_same():
 
 def test_only_what_is_possible_can_be_wished():
     live = Live("/relay_node")
-    live.wish(Wish("start"))
-    assert live.next_wish() == Wish("start")
+    live.wish(PageCommand("start"))
+    assert live.next_wish() == PageCommand("start")
     live.tell(phase="tuning")
-    live.wish(Wish("apply"))
+    live.wish(PageCommand("apply"))
     assert live.next_wish() is None
     assert not live.abort.is_set()
-    live.wish(Wish("abort"))
+    live.wish(PageCommand("abort"))
     assert live.abort.is_set()
     live.forget_wishes()
     assert not live.abort.is_set()
@@ -293,7 +293,7 @@ def test_what_is_wished_goes_to_the_loop_that_is_meant():
     with served([], lives=lives) as url:
         assert talk(url, wish) == [(0, "/tank/relay_node"), (1, "/oven/relay_node")]
     assert (lives[0].abort.is_set(), lives[1].abort.is_set()) == (False, True)
-    assert (lives[0].next_wish(), lives[1].next_wish()) == (Wish("start"), None)
+    assert (lives[0].next_wish(), lives[1].next_wish()) == (PageCommand("start"), None)
 
 
 @pytest.mark.browser

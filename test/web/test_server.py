@@ -25,7 +25,7 @@ from relay_autotune.verdict import Judgement
 from relay_autotune.web.address import Address, address_of
 from relay_autotune.web.live import Live
 from relay_autotune.web.server import Page, serve
-from relay_autotune.web.shape import Asked, Subject
+from relay_autotune.web.shape import DesignRequest, PageModel
 
 
 def get(url: str, **headers: str):
@@ -91,7 +91,7 @@ def test_the_socket_tells_everything_and_answers(url, subject):
     assert first["subjects"][0]["name"] == "a bag"
     assert first["subjects"][0]["around"] == 100
     assert answer["n"] == 7
-    shaped = subject.shaped(Asked(controller="pi", ms=1.6))
+    shaped = subject.shaped(DesignRequest(controller="pi", ms=1.6))
     assert answer["answer"]["shaped"]["isa"][0][1] == f"{shaped.gains.kc:.4f}"
     assert "unstable" in refused["answer"]["refused"]
 
@@ -165,7 +165,7 @@ def test_sockets_that_vanish_are_no_defect(url, capfd):
 
 
 def test_no_page_waits_for_the_question_of_another_one(subject):
-    class Slow(Subject):
+    class Slow(PageModel):
         begun, over = threading.Event(), False
 
         def shaped(self, asked):
@@ -216,7 +216,7 @@ def test_the_report_has_the_gains_that_were_shaped(url, subject, monkeypatch):
 
 def test_doubtful_gains_are_written_only_when_they_are_accepted(subject, monkeypatch):
     finding = replace(subject.shaping.findings[0], result=1, sentence="the data drift", remedy="x")
-    doubtful = Subject(subject.case, subject.shaping, subject.first, subject.command)
+    doubtful = PageModel(subject.case, subject.shaping, subject.first, subject.command)
     monkeypatch.setattr(
         type(subject.shaping), "judgement", lambda self, gains: Judgement((finding,))
     )

@@ -30,7 +30,7 @@ from relay_autotune.result import Shaping
 from relay_autotune.tuning import Designed, DesignOptions, designed, judged, task_of_model
 from relay_autotune.verdict import NOT_JUDGED, Verdict
 from relay_autotune.web import wire
-from relay_autotune.web.shape import Asked, Subject, asked_of
+from relay_autotune.web.shape import DesignRequest, PageModel, asked_of
 
 
 @pytest.fixture(scope="module")
@@ -46,9 +46,11 @@ def subject(analysis):
 @pytest.mark.parametrize(
     "asked",
     [
-        Asked("simc", setpoint_weight=0.25),
-        Asked(controller="pi", law="pid_controller", sample_period=0.5, setpoint_weight=0.5),
-        Asked(controller="pid", ms=1.7, noise_share=0.02),
+        DesignRequest("simc", setpoint_weight=0.25),
+        DesignRequest(
+            controller="pi", law="pid_controller", sample_period=0.5, setpoint_weight=0.5
+        ),
+        DesignRequest(controller="pid", ms=1.7, noise_share=0.02),
     ],
 )
 def test_gains_and_verdict_are_those_of_an_analysis_with_the_same_options(
@@ -61,9 +63,9 @@ def test_gains_and_verdict_are_those_of_an_analysis_with_the_same_options(
     assert found.judgement == expected.judgement
 
 
-def given(model: TransferFunction) -> Subject:
+def given(model: TransferFunction) -> PageModel:
     case = Case("a model", "", 0.0, 0.0, Outcome.UNKNOWN, "", (given_model(model),), 0)
-    return Subject(case, Shaping(task_of_model(model)), Asked(), lambda _: "tune")
+    return PageModel(case, Shaping(task_of_model(model)), DesignRequest(), lambda _: "tune")
 
 
 @pytest.mark.parametrize(
@@ -76,7 +78,7 @@ def given(model: TransferFunction) -> Subject:
     ids=["lag", "negative", "integrating"],
 )
 def test_the_steps_are_those_of_an_exact_simulation(model):
-    found = given(model).shaped(Asked(ms=1.6))
+    found = given(model).shaped(DesignRequest(ms=1.6))
     steps, gains = found.steps, found.gains
     period = steps.load_time / 2000.0
     exact = simulate_closed_loop(
@@ -92,7 +94,7 @@ def test_the_steps_are_those_of_an_exact_simulation(model):
 
 
 def test_the_band_holds_most_models_and_the_model_itself(subject):
-    found = subject.shaped(Asked())
+    found = subject.shaped(DesignRequest())
     steps = found.steps
     assert np.all(steps.low <= steps.high)
     inside = (steps.low <= steps.measurement) & (steps.measurement <= steps.high)
@@ -101,23 +103,23 @@ def test_the_band_holds_most_models_and_the_model_itself(subject):
 
 
 def test_calmer_gains_are_slower_and_all_positions_are_asked_once(subject):
-    calm, fast = subject.shaped(Asked(ms=1.2)), subject.shaped(Asked(ms=2.0))
+    calm, fast = subject.shaped(DesignRequest(ms=1.2)), subject.shaped(DesignRequest(ms=2.0))
     assert calm.gains.ms < fast.gains.ms
     assert calm.gains.iae_load > fast.gains.iae_load
-    positions = list(subject.positions(Asked(ms=1.6)))
+    positions = list(subject.positions(DesignRequest(ms=1.6)))
     assert len(set(positions)) == len(positions) == 3 * 41
     # from end to end first, then what is near
     assert {p.ms for p in positions[:6]} == {1.2, 1.36, 1.52, 1.68, 1.84, 2.0}
     assert positions[6].ms == 1.6
     assert {p.ms for p in positions[7:9]} == {1.58, 1.62}
-    known = subject.trade_off(Asked())
+    known = subject.trade_off(DesignRequest())
     assert {calm.gains.ms, fast.gains.ms} <= {gains.ms for gains in known}
-    assert subject.trade_off(Asked(law="px4_rate")) == []
+    assert subject.trade_off(DesignRequest(law="px4_rate")) == []
 
 
 def test_a_sketch_comes_near_to_the_gains_that_are_then_found(analysis):
     subject = subject_of(analysis)
-    asked = [Asked(controller="pi", ms=ms) for ms in (1.3, 1.46, 1.38)]
+    asked = [DesignRequest(controller="pi", ms=ms) for ms in (1.3, 1.46, 1.38)]
     assert subject.sketched(asked[2]) is None
     ends = [subject.shaped(each).gains.kc for each in asked[:2]]
     sketch = subject.sketched(asked[2])
@@ -159,13 +161,13 @@ def test_an_aborted_experiment_gives_no_gains(analysis):
     assert aborted.shaping is None
     shown = subject_of(aborted)
     with pytest.raises(TuningError, match="aborted"):
-        shown.shaped(Asked())
+        shown.shaped(DesignRequest())
     assert wire.of_subject(shown)["may_shape"] is False
     assert wire.of_subject(shown)["verdict"]["tone"] == "bad"
 
 
 def test_what_goes_to_the_browser_is_json_with_the_words_of_the_report(subject):
-    shaped = subject.shaped(Asked())
+    shaped = subject.shaped(DesignRequest())
     document = json.loads(wire.to_text(wire.of_shaped(subject, shaped)))
     assert document["isa"][0][:3] == ["kc", f"{shaped.gains.kc:.4f}", "u/y"]
     assert document["verdict"]["text"] == "gains ready to use"
@@ -176,7 +178,7 @@ def test_what_goes_to_the_browser_is_json_with_the_words_of_the_report(subject):
 
 def test_no_number_that_json_does_not_know_goes_out():
     found = given(TransferFunction(0.05, integrators=1, dead_time=2.0))
-    text = wire.to_text(wire.of_shaped(found, found.shaped(Asked(controller="pi"))))
+    text = wire.to_text(wire.of_shaped(found, found.shaped(DesignRequest(controller="pi"))))
     assert not {"NaN", "Infinity"} & set(text.replace(":", " ").replace(",", " ").split())
     assert wire.to_text(wire.of_subject(found))
 
@@ -198,7 +200,7 @@ def test_the_command_line_that_is_shown_gives_the_same_again(tmp_path):
     options = parser.parse_args(["--web", "--pi", "--present", "0.4", "20", "0", bag])
     typed = as_typed(
         "replay", parser, options, web=None, web_address=None,
-        **vars(Asked("robust", "pid", 1.62, 0.3)),
+        **vars(DesignRequest("robust", "pid", 1.62, 0.3)),
     )  # fmt: skip
     words = shlex.split(typed)
     assert words[0] == "replay"

@@ -14,8 +14,8 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError, RecordError
-from relay_autotune.identification.shown.fourier import frequency_point
-from relay_autotune.identification.waveform.residuals import worth
+from relay_autotune.identification.limit_cycle.fourier import frequency_point
+from relay_autotune.identification.waveform.residuals import effective_sample_fraction
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.cycles import cycles_of
@@ -209,7 +209,7 @@ def _factors(
     residual = measured - factors @ scaled
     variance = float(residual @ residual) / measured.size
     if correlated:
-        variance /= worth(residual)
+        variance /= effective_sample_fraction(residual)
     covariance = np.linalg.pinv(scaled @ scaled.T, rcond=_ALIKE**2) * variance
     count = len(parts)
     return factors[:count] / size[:count], (covariance / np.outer(size, size))[:count, :count]

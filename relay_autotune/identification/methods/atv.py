@@ -21,6 +21,8 @@ from dataclasses import replace
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.limit_cycle.dead_time import DeadTime
+from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.methods.lags import constants_text
 from relay_autotune.identification.methods.square_wave import FIRST
 from relay_autotune.identification.methods.symmetric_method import (
@@ -30,8 +32,6 @@ from relay_autotune.identification.methods.symmetric_method import (
     read_limit_cycle,
 )
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.shown.dead_time import DeadTime
-from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.process.structures import Structure
 from relay_autotune.record.record import Record
 

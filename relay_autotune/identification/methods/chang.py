@@ -21,6 +21,7 @@ import numpy as np
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.methods.lags import (
     MODEL_4,
     MODEL_5,
@@ -34,7 +35,6 @@ from relay_autotune.identification.methods.symmetric_method import (
     from_record,
 )
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.process.structures import Structure
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record

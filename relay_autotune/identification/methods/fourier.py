@@ -23,21 +23,21 @@ from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate, jacobian
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.methods.fit import Fit
-from relay_autotune.identification.result import Identification, identified
-from relay_autotune.identification.shown.fourier import (
+from relay_autotune.identification.limit_cycle.fourier import (
     FrequencyPoint,
     measured_points,
     static_gain,
     steady_state,
     with_noise_about,
 )
-from relay_autotune.identification.shown.limit_cycle import (
+from relay_autotune.identification.limit_cycle.limit_cycle import (
     NOT_SETTLED,
     RelayTest,
     known_gain,
     relay_test,
 )
+from relay_autotune.identification.methods.fit import Fit
+from relay_autotune.identification.result import Identification, identified
 from relay_autotune.process.structures import (
     FOPDT,
     INTEGRATOR_LAG,

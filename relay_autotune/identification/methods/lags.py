@@ -29,8 +29,8 @@ from scipy.optimize import brentq
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.methods.square_wave import EXACT, FIRST, Wave
-from relay_autotune.identification.shown.limit_cycle import SymmetricCycle
 from relay_autotune.process.structures import (
     FOPDT,
     LAG_N,

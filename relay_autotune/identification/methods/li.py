@@ -29,6 +29,16 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.limit_cycle.limit_cycle import (
+    NOT_SETTLED,
+    CycleReader,
+    RelayTest,
+    SymmetricCycle,
+    features,
+    relay_test,
+    require_unbiased,
+    skew_warning,
+)
 from relay_autotune.identification.methods.fit import Fit
 from relay_autotune.identification.methods.lags import (
     MODEL_1,
@@ -43,16 +53,6 @@ from relay_autotune.identification.methods.lags import (
 from relay_autotune.identification.methods.square_wave import level, peak
 from relay_autotune.identification.methods.symmetric_method import alike, shape_misfit
 from relay_autotune.identification.result import Identification, identified
-from relay_autotune.identification.shown.limit_cycle import (
-    NOT_SETTLED,
-    CycleReader,
-    RelayTest,
-    SymmetricCycle,
-    features,
-    relay_test,
-    require_unbiased,
-    skew_warning,
-)
 from relay_autotune.process.structures import Structure, equal_lags
 from relay_autotune.record.record import Record
 

@@ -21,6 +21,18 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate, carried
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.limit_cycle.dead_time import DeadTime, read_dead_time
+from relay_autotune.identification.limit_cycle.limit_cycle import (
+    NOT_SETTLED,
+    CycleReader,
+    CycleRun,
+    SymmetricCycle,
+    half_cycles,
+    known_gain,
+    relay_test,
+    require_unbiased,
+    skew_warning,
+)
 from relay_autotune.identification.methods.lags import (
     MODEL_1,
     MODEL_4,
@@ -35,18 +47,6 @@ from relay_autotune.identification.methods.lags import (
 )
 from relay_autotune.identification.methods.square_wave import EXACT, Wave, level
 from relay_autotune.identification.result import Identification, identified
-from relay_autotune.identification.shown.dead_time import DeadTime, read_dead_time
-from relay_autotune.identification.shown.limit_cycle import (
-    NOT_SETTLED,
-    CycleReader,
-    CycleRun,
-    SymmetricCycle,
-    half_cycles,
-    known_gain,
-    relay_test,
-    require_unbiased,
-    skew_warning,
-)
 from relay_autotune.process.structures import Structure, equal_lags
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Record

@@ -190,7 +190,7 @@ def dead_time_ratio(growth: float) -> float:
 def order_from_curvature(curvature: float) -> float:
     """Return the order n (eq 28, the logarithm to base 10).
 
-    The paper does not define tau_C; see :func:`~relay_autotune.identification.shown.shape.
+    The paper does not define tau_C; see :func:`~relay_autotune.identification.limit_cycle.shape.
     curvature_time`. Even for that reading n = 5 comes out as 7, and any other start of the test
     than at rest under an ideal relay gives other numbers.
 

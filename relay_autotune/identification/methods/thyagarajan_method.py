@@ -21,6 +21,20 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate, carried
 from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.limit_cycle.limit_cycle import (
+    NOT_SETTLED,
+    SymmetricCycle,
+    relay_test,
+    require_unbiased,
+    skew_warning,
+)
+from relay_autotune.identification.limit_cycle.shape import (
+    Reading,
+    Shape,
+    curvature_time,
+    envelope,
+    read_shape,
+)
 from relay_autotune.identification.methods.lags import equal
 from relay_autotune.identification.methods.square_wave import FIRST
 from relay_autotune.identification.methods.thyagarajan2003 import (
@@ -33,20 +47,6 @@ from relay_autotune.identification.methods.thyagarajan2003 import (
     unstable_fopdt,
 )
 from relay_autotune.identification.result import Identification, identified
-from relay_autotune.identification.shown.limit_cycle import (
-    NOT_SETTLED,
-    SymmetricCycle,
-    relay_test,
-    require_unbiased,
-    skew_warning,
-)
-from relay_autotune.identification.shown.shape import (
-    Reading,
-    Shape,
-    curvature_time,
-    envelope,
-    read_shape,
-)
 from relay_autotune.process.model_parameters import DEAD_TIME, GAIN, TIME_CONSTANT, Parameter
 from relay_autotune.process.structures import FOPDT, IPDT, LAG_N, UNSTABLE_FOPDT, Structure
 from relay_autotune.process.transfer_function import TransferFunction

@@ -26,22 +26,27 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate, carried
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.methods.first_order import first_order
-from relay_autotune.identification.result import Identification, identified
-from relay_autotune.identification.shown.fold import Fold, fold, level_at_switch, scatter_of_fold
-from relay_autotune.identification.shown.fourier import (
+from relay_autotune.identification.limit_cycle.fold import (
+    Fold,
+    fold,
+    level_at_switch,
+    scatter_of_fold,
+)
+from relay_autotune.identification.limit_cycle.fourier import (
     UNKNOWN_REST,
     StaticGain,
     static_gain,
     steady_state,
 )
-from relay_autotune.identification.shown.limit_cycle import (
+from relay_autotune.identification.limit_cycle.limit_cycle import (
     NOT_SETTLED,
     RelayTest,
     known_gain,
     relay_test,
     require_unbiased,
 )
+from relay_autotune.identification.methods.first_order import first_order
+from relay_autotune.identification.result import Identification, identified
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.record.record import Record
 

@@ -31,7 +31,7 @@ def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
     return np.asarray(products[1:] / products[0])
 
 
-def worth(residual: FloatArray, errors: float = 0.0) -> float:
+def effective_sample_fraction(residual: FloatArray, errors: float = 0.0) -> float:
     """Return the number of independent samples that one correlated sample is worth, up to 1.
 
     With a correlation rho of neighbours, n samples tell no more than ``n (1 - rho)/(1 + rho)``

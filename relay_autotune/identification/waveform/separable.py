@@ -458,7 +458,11 @@ def _solve(normal: FloatArray, gradient: FloatArray, damping: float) -> FloatArr
 
 
 def information_criterion(
-    cost: float, samples: int, parameters: int, floor: float, worth: float = 1.0
+    cost: float,
+    samples: int,
+    parameters: int,
+    floor: float,
+    effective_sample_fraction: float = 1.0,
 ) -> float:
     """Return the Bayesian information criterion, ``n log(cost/samples) + p log n``.
 
@@ -468,5 +472,5 @@ def information_criterion(
     :param floor: sum of squares that is rounding: smaller ones count as equal to it.
     :param worth: number of independent samples that each is worth; n is the product.
     """
-    n = samples * worth
+    n = samples * effective_sample_fraction
     return n * math.log(max(cost, floor) / samples) + parameters * math.log(max(n, 3.0))

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from relay_autotune.errors import ModelError
-from relay_autotune.identification.shown.shape import shape_of_half_cycle
+from relay_autotune.identification.limit_cycle.shape import shape_of_half_cycle
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.transfer_function import TransferFunction

@@ -13,8 +13,8 @@ import numpy as np
 from relay_autotune.errors import IdentificationError
 from relay_autotune.experiment.settling import ResponseDetector, RestState
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.shown.fold import Fold, fold
-from relay_autotune.identification.shown.limit_cycle import CycleRun, RelayTest
+from relay_autotune.identification.limit_cycle.fold import Fold, fold
+from relay_autotune.identification.limit_cycle.limit_cycle import CycleRun, RelayTest
 from relay_autotune.record.record import Record, RelaySettings
 
 # Least jump of the rate at a sharp edge, relative to its largest value: that of one lag jumps by

@@ -29,7 +29,7 @@ from scipy.sparse import csr_array
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.record.cycles import find_cycles, limit_cycle, settings_of
-from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings, asked_once
+from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings, cached_on_record
 
 _RIDGE = 1e-13
 _TOLERANCE = 1e-7
@@ -368,7 +368,7 @@ def fold(record: Record, cycles: tuple[int, ...] = (), *, sharp: bool = False) -
     return _averaged(record, cycles or limit_cycle(record).cycles, sharp)
 
 
-@asked_once
+@cached_on_record
 def fold_without(
     record: Record, cycles: tuple[int, ...], left_out: int, sharp: bool = False
 ) -> Fold:
@@ -413,7 +413,7 @@ def scatter_of_fold(
     return np.asarray(away.T @ away * (count - 1) / len(parts))
 
 
-@asked_once
+@cached_on_record
 def _averaged(record: Record, cycles: tuple[int, ...], sharp: bool) -> Fold:
     return _average(record, cycles, None, sharp=sharp)
 

@@ -24,10 +24,10 @@ from scipy.special import fdtrc
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.shown.fold import Fold, fold, scatter_of_fold
+from relay_autotune.identification.limit_cycle.fold import Fold, fold, scatter_of_fold
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.record.cycles import cycles_of, limit_cycle, settings_of
-from relay_autotune.record.record import Record, asked_once
+from relay_autotune.record.record import Record, cached_on_record
 
 _LEAST_PEAKS = 6
 _QUICKEST = 0.1
@@ -49,7 +49,7 @@ class Envelope:
     height: FloatArray
 
 
-@asked_once
+@cached_on_record
 def envelope(record: Record) -> Envelope:
     """Return the peaks of all whole cycles of a record.
 
@@ -391,7 +391,7 @@ class Reading:
 _VARYING = ("half_period", "amplitude", "level", "time_to_peak", "rise", "rise_half")
 
 
-@asked_once
+@cached_on_record
 def shape_of_record(record: Record) -> Shape:
     """Return the shape of a relay test, the mean of its two halves.
 

@@ -15,11 +15,11 @@ import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.shown.limit_cycle import CycleRun, RelayTest
+from relay_autotune.identification.limit_cycle.limit_cycle import CycleRun, RelayTest
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.quantities import told
-from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings, asked_once
+from relay_autotune.quantities import result_field
+from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings, cached_on_record
 
 _SMALL_ANGLE = 0.2
 
@@ -28,9 +28,9 @@ _SMALL_ANGLE = 0.2
 class FrequencyPoint:
     """The process at one frequency."""
 
-    frequency: float = told("rad/s", nan=True).means("w.")
-    value: complex = told("y/u", nan=True).means("G(j w).")
-    std: float = told("y/u", math.nan, lower=0.0).means(
+    frequency: float = result_field("rad/s", nan=True).means("w.")
+    value: complex = result_field("y/u", nan=True).means("G(j w).")
+    std: float = result_field("y/u", math.nan, lower=0.0).means(
         "Standard deviation of its real and of its imaginary part; NaN: not estimated."
     )
 
@@ -210,7 +210,7 @@ class StaticGain:
         return math.hypot(self.scatter, rest.std / self.excursion)
 
 
-@asked_once
+@cached_on_record
 def steady_state(record: Record, settings: RelaySettings) -> SteadyState:
     """Return the measurement at rest.
 
