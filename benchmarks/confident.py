@@ -41,7 +41,7 @@ from information import relative_bounds
 from processes import true_point
 from sampled_relay import exact_limit_cycle
 
-from relay_autotune.analysis import RunningFit, Task, analyse_alone
+from relay_autotune.analysis import RunningFit, Task, analyse
 from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN, EarlyEnd, FitProgress
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.process.structures import (
@@ -202,7 +202,7 @@ class Bench:
 
     def _true_ms(self, record: Record) -> float:
         """Return the Ms of the gains after a test on the process; NaN: there are none."""
-        gains = analyse_alone(record).best_gains
+        gains = analyse(record, alone=True).best_gains
         if gains is None:
             return math.nan
         options = DesignOptions(sample_period=self.period)

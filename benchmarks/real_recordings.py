@@ -33,7 +33,7 @@ from relay_autotune import threads  # noqa: F401  before numpy
 import numpy as np
 from markdown import table, three
 
-from relay_autotune.analysis import analyse_alone
+from relay_autotune.analysis import analyse
 from relay_autotune.bag.reader import read_records
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.loop.analysis import ms_on
@@ -141,7 +141,7 @@ def halves_of(path: Path) -> list[Half] | None:
         return None
     record: Record = records[0]
     n = len(record)
-    halves = [Half(analyse_alone(record.part(a, b))) for a, b in pairwise((0, n // 2, n))]
+    halves = [Half(analyse(record.part(a, b), alone=True)) for a, b in pairwise((0, n // 2, n))]
     return None if any(h.found.best_gains is None for h in halves) else halves
 
 

@@ -32,7 +32,7 @@ from random_experiments import Experiment, with_delay
 from simulated_summary import summary
 
 import relay_autotune
-from relay_autotune.analysis import Task, analyse_alone
+from relay_autotune.analysis import analyse
 from relay_autotune.identification.known import Known
 from relay_autotune.loop.analysis import frequencies, is_stable, sensitivity_peaks
 from relay_autotune.process.ultimate import ultimate_point
@@ -131,11 +131,11 @@ def run(seed: int, state: str) -> Result:
     if experiment.caused_at >= 0:
         result.delay = experiment.ended_at - experiment.caused_at
     if tune.outcome is Outcome.COMPLETED:
-        judge(result, experiment, analyse_alone(tune.record()))
+        judge(result, experiment, analyse(tune.record(), alone=True))
     elif tune.finished and tune.sample_count:
         # What identifier_node would publish; one structure is enough to see that there is none.
         known = Known(structure="fopdt")
-        result.gains = analyse_alone(tune.record(), Task(known=known)).best_gains is not None
+        result.gains = analyse(tune.record(), known=known, alone=True).best_gains is not None
     result.seconds = wall.process_time() - began
     return result
 

@@ -30,7 +30,7 @@ from markdown import table
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from relay_autotune.analysis import analyse_alone
+from relay_autotune.analysis import analyse
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.loop.gains import ControlLaw
@@ -269,7 +269,7 @@ def outcome(number: int) -> Outcome | None:
     if made.record is None:
         return None
     begin = clock.process_time()
-    found = analyse_alone(made.record)
+    found = analyse(made.record, alone=True)
     seconds = clock.process_time() - begin
     gains, model = found.best_gains, found.model
     held = None

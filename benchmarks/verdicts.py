@@ -3,27 +3,30 @@
 
 """How often each check fails on right and on wrong models, over records of many kinds.
 
-    . ./env.sh && python3 -m benchmarks.verdicts [RUNS]
+    . ./env.sh && python3 benchmarks/verdicts.py [--runs N] [--quick]
 
-Each kind is recorded RUNS times (default 20), with another seed for the noise: by steps from rest,
-or by a relay experiment. A result is right where its gains, on the true process, make a stable
+Each kind is recorded N times, with another seed for the noise: by steps from rest, or by a relay
+experiment. A result is right where its gains, on the true process, make a stable
 loop with Ms of at most 1.75 (1.25 times what is asked for); of a nonlinear process the truth is
 its linearisation where it rests.
 """
 
 from __future__ import annotations
 
+import argparse
 import math
-import sys
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from relay_autotune import threads  # noqa: F401  before numpy
+
+# isort: split
 import numpy as np
+from markdown import table
 from numpy.typing import NDArray
 
-from benchmarks.markdown import table
-from relay_autotune.analysis import analyse_alone
+from relay_autotune.analysis import analyse
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.loop.gains import Gains
@@ -194,55 +197,54 @@ class Tally:
     wrong: Counter[Verdict] = field(default_factory=Counter)
 
 
-def main(runs: int = 20) -> None:
-    """Count, and print both tables after each round, so that it may be ended early."""
-    tests = [(kind, relay) for kind in KINDS for relay in (False, True)]
-    tallies = [Tally() for _ in tests]
+def main() -> None:
+    """Print both tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=20, help="records of each kind and test")
+    parser.add_argument("--quick", action="store_true", help="only show that it runs")
+    asked = parser.parse_args()
+    kinds, runs = (KINDS[:1], 1) if asked.quick else (KINDS, asked.runs)
+    tallies = [(kind, relay, Tally()) for kind in kinds for relay in (False, True)]
     spoke: dict[bool, Counter[str]] = {True: Counter(), False: Counter()}
     count: Counter[bool] = Counter()
     refused: Counter[str] = Counter()
-    for seed in range(runs):
-        for (kind, relay), tally in zip(tests, tallies, strict=True):
+    for kind, relay, tally in tallies:
+        for seed in range(runs):
             record = record_of(kind, seed, relay=relay)
             if record is None:
                 tally.verdicts[Verdict.NONE] += 1
                 continue
-            found = analyse_alone(record)
+            found = analyse(record, alone=True)
             tally.verdicts[found.verdict] += 1
-            gains = found.best_gains
+            gains, findings = found.best_gains, found.judgement.findings
             if gains is None:
-                failed = [f for f in found.judgement.findings if f.result is Result.FAILED]
-                refused.update(f.name for f in failed)
+                refused.update(f.name for f in findings if f.result is Result.FAILED)
                 continue
             right = kind.ms(gains) <= _LIMIT
             count[right] += 1
             tally.wrong[found.verdict] += not right
-            spoke[right].update(
-                f.name for f in found.judgement.findings if f.result is not Result.PASSED
-            )
-            print(kind.name, relay, found.verdict.name, right, file=sys.stderr, flush=True)
-        head = ["record", "test", "trusted", "doubtful", "none"]
-        rows = [
-            [
-                kind.name,
-                "relay" if relay else "steps",
-                *(str(t.verdicts[v]) for v in (Verdict.TRUSTED, Verdict.DOUBTFUL, Verdict.NONE)),
-                *(str(t.wrong[v]) for v in (Verdict.TRUSTED, Verdict.DOUBTFUL)),
-            ]
-            for (kind, relay), t in zip(tests, tallies, strict=True)
-        ]
-        print(table([*head, "wrong trusted", "wrong doubtful"], rows), end="\n\n")
-        shares = [
-            [
-                f"`{c.name}`",
-                *(f"{spoke[r][c.name]} of {count[r]}" for r in (True, False)),
-                str(refused[c.name]),
-            ]
-            for c in CHECKS
-        ]
-        head = ["check", "spoke on right gains", "spoke on wrong gains", "refused gains"]
-        print(table(head, shares), end="\n\n", flush=True)
+            spoke[right].update(f.name for f in findings if f.result is not Result.PASSED)
+    rows = [
+        (
+            kind.name,
+            "relay" if relay else "steps",
+            *(tally.verdicts[v] for v in (Verdict.TRUSTED, Verdict.DOUBTFUL, Verdict.NONE)),
+            *(tally.wrong[v] for v in (Verdict.TRUSTED, Verdict.DOUBTFUL)),
+        )
+        for kind, relay, tally in tallies
+    ]
+    head = ("record", "test", "trusted", "doubtful", "none", "wrong trusted", "wrong doubtful")
+    print(table(head, rows), end="\n\n")
+    shares = [
+        (
+            f"`{check.name}`",
+            *(f"{spoke[right][check.name]} of {count[right]}" for right in (True, False)),
+            refused[check.name],
+        )
+        for check in CHECKS
+    ]
+    print(table(("check", "spoke on right gains", "spoke on wrong gains", "refused"), shares))
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:2]))
+    main()

@@ -148,16 +148,6 @@ def analyse(
     return _assessed(chosen, models, _Tuning(task, rules, simple, rng, tell))
 
 
-def analyse_alone(record: Record, task: Task | None = None) -> Analysis:
-    """Identify a record by one method and, where the experiment was completed, tune by one rule.
-
-    :param record: the experiment.
-    :param task: method, rule, what is known and asked; None: the defaults.
-    :raises RelayAutotuneError: if it is not a record.
-    """
-    return analyse(record, **vars(task or Task()), alone=True)
-
-
 def model_so_far(record: Record, task: Task | None = None) -> Analysis:
     """Identify the record of a running experiment by one method.
 

@@ -48,6 +48,7 @@ QUICK = {
     "structure_choice": ("--quick",),
     "coverage": ("--quick",),
     "ah_batch": ("--quick",),
+    "verdicts": ("--quick",),
     "design_known": ("--quick",),
     "laws": ("--quick",),
     "design_identified": ("--quick",),

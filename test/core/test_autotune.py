@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sampled_relay import simulate_sampled_relay
 
-from relay_autotune.analysis import Task, analyse, analyse_alone, model_so_far
+from relay_autotune.analysis import analyse, model_so_far
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.judgement.disturbance import last_cycles
 from relay_autotune.identification.known import Known
@@ -92,7 +92,7 @@ def test_while_it_runs_there_is_a_model_and_no_gains():
 )
 def test_alone_they_are_what_they_are_beside_others(method, rule):
     beside = _analysed(method, rule)
-    alone = analyse_alone(_record(), Task(method, rule))
+    alone = analyse(_record(), method=method, rule=rule, alone=True)
     assert [m.method for m in alone.models] == [method]
     assert alone.model.values.tolist() == beside.model.values.tolist()
     assert alone.model.fit.residual_rms == beside.model.fit.residual_rms

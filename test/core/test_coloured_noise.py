@@ -13,7 +13,7 @@ import pytest
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
-from relay_autotune.analysis import analyse_alone
+from relay_autotune.analysis import analyse
 from relay_autotune.identification.known import NOTHING
 from relay_autotune.identification.waveform.candidates import FitContext, nuisances_of, support
 from relay_autotune.identification.waveform.choice import _compared, _simulates, chosen_fit
@@ -300,7 +300,7 @@ def test_an_integrator_that_is_driven_one_way_is_no_lag_of_many_records():
     wheel = TransferFunction(6.0, (0.004,), integrators=1)
     y = response(wheel, time, PiecewiseConstant(time, u, 0.0))
     noise = lfilter([0.3], [1.0, -0.9], rng.normal(0.0, 1.0, time.size))
-    found = analyse_alone(Record(time=time, measurement=y + noise, command=u))
+    found = analyse(Record(time=time, measurement=y + noise, command=u), alone=True)
     assert found.model.model.integrators == 1
     assert found.model.model.gain == pytest.approx(6.0, rel=0.01)
     assert found.best_gains is not None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from virtual_tune import tuned
 
-from relay_autotune.analysis import analyse_alone
+from relay_autotune.analysis import analyse
 from relay_autotune.experiment.experiment import ExperimentParameters
 from relay_autotune.identification.methods import identify
 from relay_autotune.process.structures import structure_named
@@ -46,7 +46,7 @@ def run(model, *, sign, period, **acting):
 def test_a_record_that_speaks_for_the_other_direction_yields_no_gains(model, period, noise_std):
     tune = run(model, sign=-model.process_sign, period=period, noise_std=noise_std)
     assert tune.outcome is Outcome.COMPLETED
-    found = analyse_alone(tune.record())
+    found = analyse(tune.record(), alone=True)
     assert found.best_gains is None
     assert f"process_gain_sign {model.process_sign} " in found.reason
     # What the relay's own direction would have given is a model of the wrong sign.
@@ -62,7 +62,7 @@ def test_a_record_that_speaks_for_the_other_direction_yields_no_gains(model, per
 def test_the_right_direction_of_an_inverse_response_yields_gains(model, period):
     noise = {"noise_std": 0.01 * abs(model.gain)}
     tune = run(model, sign=model.process_sign, period=period, **noise)
-    found = analyse_alone(tune.record())
+    found = analyse(tune.record(), alone=True)
     assert found.best_gains is not None
     assert np.sign(found.best_gains.kc) == model.process_sign
 
@@ -83,6 +83,6 @@ def test_what_a_disturbance_leaves_does_not_speak_for_the_other_direction(acting
     model = TransferFunction.fopdt(1.0, 1.0, 0.7)
     tune = run(model, sign=1, period=0.03, **acting)
     assert tune.outcome is Outcome.COMPLETED
-    found = analyse_alone(tune.record())
+    found = analyse(tune.record(), alone=True)
     assert all(m.process_sign == 1 for m in found.model.draws)
     assert found.best_gains is not None

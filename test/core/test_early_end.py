@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relay_autotune.analysis import RunningFit, Task, analyse_alone, model_so_far
+from relay_autotune.analysis import RunningFit, Task, analyse, model_so_far
 from relay_autotune.experiment.early_end import MS, ULTIMATE_GAIN, EarlyEnd, FitProgress
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.process.transfer_function import TransferFunction
@@ -131,7 +131,7 @@ def test_a_test_of_three_lags_ends_early_and_its_interval_is_true():
     # The median of a normal error is a third of this interval; three times it is 1 in 1e8.
     assert abs(found.ultimate_gain / truth - 1.0) < 3.0 * 0.02
     record = tune.record()
-    assert analyse_alone(record).best_gains is not None
+    assert analyse(record, alone=True).best_gains is not None
 
 
 @pytest.mark.long
@@ -140,7 +140,7 @@ def test_the_predicted_ms_holds_on_the_process():
     tune, found = _ended(model, MS, 0.04)
     assert "predicted Ms is within" in tune.reason
     assert 0.5 * (found.ms_high - found.ms_low) <= 0.04 * found.ms
-    gains = analyse_alone(tune.record()).best_gains
+    gains = analyse(tune.record(), alone=True).best_gains
     options = DesignOptions(sample_period=PERIOD)
     loop = replace(model, dead_time=model.dead_time + options.added_delay)
     true_ms = analyse_loop(gains, loop).ms

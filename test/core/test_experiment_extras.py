@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from fopdt_plant import FopdtPlant, run, wang_limit_cycle
 
-from relay_autotune.analysis import analyse_alone
+from relay_autotune.analysis import analyse
 from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment, SafePolicy
 from relay_autotune.experiment.faults import (
@@ -139,7 +139,7 @@ def test_both_levels_clipped_alike_within_the_limits_are_not_trusted(share, std)
         if tune.finished:
             break
     if tune.outcome is Outcome.COMPLETED:
-        assert analyse_alone(tune.record()).verdict is not Verdict.TRUSTED
+        assert analyse(tune.record(), alone=True).verdict is not Verdict.TRUSTED
 
 
 def test_a_kick_that_noise_seemed_to_answer_is_made_larger():

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from analysed import completed
 
-from relay_autotune.analysis import analyse, analyse_alone
+from relay_autotune.analysis import analyse
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.judgement.checks import (
@@ -65,7 +65,7 @@ def record():
 
 @pytest.fixture(scope="module")
 def gains(record):
-    return analyse_alone(record).best_gains
+    return analyse(record, alone=True).best_gains
 
 
 def test_the_visible_error_is_the_difference_of_two_processes(record):
@@ -131,7 +131,7 @@ def test_steps_and_relays_of_ordinary_processes_are_trusted(record):
 def test_a_record_that_is_mostly_another_input_is_doubtful():
     record = steps(PROCESS, noise=0.0)
     other = np.cumsum(np.random.default_rng(8).normal(0.0, 0.35, len(record)))
-    found = analyse_alone(replace(record, measurement=record.measurement + other))
+    found = analyse(replace(record, measurement=record.measurement + other), alone=True)
     assert found.verdict is not Verdict.TRUSTED
 
 
@@ -241,7 +241,7 @@ def test_a_half_that_shows_nothing_objects_to_nothing():
     record = joined(PROCESS, PROCESS)
     noise = np.random.default_rng(9).normal(0.0, 0.4, len(record))
     noisy = replace(record, measurement=record.measurement + np.where(record.time < 260, noise, 0))
-    findings_of = {f.name: f for f in analyse_alone(noisy).judgement.findings}
+    findings_of = {f.name: f for f in analyse(noisy, alone=True).judgement.findings}
     assert findings_of["halves"].result is Result.PASSED
     assert findings_of["direction"].result is Result.PASSED
 
@@ -316,7 +316,7 @@ def test_a_controller_that_is_read_backward_gives_no_gains():
     record = fed_back(TransferFunction.fopdt(2.0, 4.0, 1.0), 1.5)
     assert read_backward(record, TransferFunction(-1.0 / 1.5)) == pytest.approx(1.0, abs=0.01)
     assert read_backward(record, TransferFunction.fopdt(2.0, 4.0, 1.0)) < 0.5
-    assert analyse_alone(record).best_gains is None
+    assert analyse(record, alone=True).best_gains is None
 
 
 @pytest.mark.parametrize("command", ["slow", "random"])
@@ -353,9 +353,9 @@ def test_levels_near_one_another_do_not_tell_what_is_lost_beyond_them():
 
 @pytest.mark.nightly
 def test_gains_from_a_clipped_actuator_are_not_trusted():
-    assert analyse_alone(clipped_steps(9.0)).verdict is Verdict.TRUSTED
-    assert analyse_alone(clipped_steps(0.7)).verdict is not Verdict.TRUSTED
-    assert analyse_alone(clipped_steps(1.5)).verdict is not Verdict.TRUSTED
+    assert analyse(clipped_steps(9.0), alone=True).verdict is Verdict.TRUSTED
+    assert analyse(clipped_steps(0.7), alone=True).verdict is not Verdict.TRUSTED
+    assert analyse(clipped_steps(1.5), alone=True).verdict is not Verdict.TRUSTED
 
 
 @pytest.mark.long
@@ -373,7 +373,7 @@ def test_a_relay_whose_levels_are_clipped_on_one_side_gives_no_trusted_gains():
         plant.command(tune.step(0.5 * k, plant.measure(0.5 * k)))
         if tune.finished:
             break
-    found = analyse_alone(tune.record())
+    found = analyse(tune.record(), alone=True)
     assert found.verdict is not Verdict.TRUSTED
     clipped = {f.name: f for f in found.judgement.findings}["clipped"]
     assert clipped.result is not Result.PASSED

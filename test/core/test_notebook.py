@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from relay_autotune.analysis import analyse, analyse_alone
+from relay_autotune.analysis import analyse
 from relay_autotune.errors import RecordError
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.methods import identify
@@ -71,7 +71,7 @@ def test_an_interval_below_the_digits_shown_is_no_number_of_its_own() -> None:
     assert plus_minus(2.307, math.nan) == ""
 
 
-@pytest.mark.parametrize("function", [analyse, identify, analyse_alone])
+@pytest.mark.parametrize("function", [analyse, identify])
 def test_what_is_no_record_gets_a_sentence(function) -> None:
     with pytest.raises(RecordError, match="takes one record, found a tuple of 2: give one"):
         function((RECORD, RECORD))

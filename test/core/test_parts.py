@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from sampled_relay import simulate_sampled_relay
 
-from relay_autotune.analysis import analyse_alone
+from relay_autotune.analysis import analyse
 from relay_autotune.parts import agreed
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
@@ -31,7 +31,7 @@ def part(gain: float, seed: int) -> Analysis:
     )
     noise = np.random.default_rng(seed).normal(0.0, 0.01, 900)
     model = TransferFunction.fopdt(gain, 20.0, 10.0)
-    return analyse_alone(simulate_sampled_relay(model, settings, period=0.25, noise=noise))
+    return analyse(simulate_sampled_relay(model, settings, period=0.25, noise=noise), alone=True)
 
 
 @pytest.fixture(scope="module")

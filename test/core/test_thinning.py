@@ -6,7 +6,7 @@
 import numpy as np
 import pytest
 
-from relay_autotune.analysis import analyse_alone
+from relay_autotune.analysis import analyse
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.process.response import response
@@ -155,7 +155,7 @@ def test_an_analysis_says_so_and_designs_for_single_samples():
     rng = np.random.default_rng(9)
     t = np.linspace(0.0, 1000.0, 30_000)
     record = made(SLOW, t, levels(t, 50.0, rng), rng)
-    found = analyse_alone(record)
+    found = analyse(record, alone=True)
     assert any(f"of {t.size} samples" in w for w in found.model.warnings)
     assert found.record.unthinned.noise == pytest.approx(NOISE, rel=0.1)
     # The period of a design has three digits: 0.0333 of 0.033334.
