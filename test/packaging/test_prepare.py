@@ -124,3 +124,20 @@ def test_exports_name_this_machine(prepare, monkeypatch, tmp_path):
     assert file.read_text() == 'INCLUDES "/here/python;/here/numpy;include/std_msgs"\n'
     file.write_text(f"{built}/share/elsewhere\n")
     assert "export.cmake" in refusal(prepare.repair_exports)
+
+
+def test_what_tests_it_is_installed_once_into_each_environment(prepare, monkeypatch):
+    """A demo needs none of it, and an environment that is made anew has lost it."""
+    prepare.VENV.mkdir()
+    installed = []
+    monkeypatch.setattr(prepare, "prepare_main", lambda: None)
+    monkeypatch.setattr(
+        prepare, "install", lambda path, wanted, environment: installed.append(path)
+    )
+    prepare.mark(prepare.VENV, "made")
+    prepare.prepare_tests()
+    prepare.prepare_tests()
+    assert installed == [prepare.VENV]
+    prepare.mark(prepare.VENV, "made anew")
+    prepare.prepare_tests()
+    assert installed == [prepare.VENV] * 2
