@@ -11,8 +11,10 @@ A page asks for it with a pair of comments, and what is between them is replaced
     <!-- text of FILE -->                <!-- end -->    a file, in a fenced block
     <!-- checks of judgement -->         <!-- end -->    the table of checks behind a verdict
     <!-- laws of equations -->           <!-- end -->    a table of the laws that gains are for
+    <!-- reasons of 300 -->              <!-- end -->    a table of the reasons of 300 to 399
 
-It also writes config/parameters.yaml, in which every parameter of every node has its default.
+It also writes config/parameters.yaml, in which every parameter of every node has its default, and
+relay_autotune_msgs/msg/Reason.msg, in which every reason has its constant.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from relay_autotune.identification.judgement.table import CHECKS
@@ -30,10 +33,12 @@ from relay_autotune.nodes.identifier_parameters import PARAMETERS as IDENTIFIER_
 from relay_autotune.nodes.plant import PARAMETERS as PLANT_PARAMETERS
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS, FIXED_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.quantities import Quantity
+from relay_autotune.reasons import Code
 from relay_autotune.verdict import Check
 
 ROOT = Path(__file__).resolve().parent.parent
 PARAMETER_FILE = ROOT / "config/parameters.yaml"
+REASON_FILE = ROOT / "relay_autotune_msgs/msg/Reason.msg"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 
 TABLES: Mapping[str, Sequence[Quantity]] = {
@@ -44,7 +49,8 @@ TABLES: Mapping[str, Sequence[Quantity]] = {
 }
 
 _BLOCK = re.compile(
-    r"<!-- (?P<kind>parameters|text|checks|laws) of (?P<what>\S+) -->\n.*?<!-- end -->", re.DOTALL
+    r"<!-- (?P<kind>parameters|text|checks|laws|reasons) of (?P<what>\S+) -->\n.*?<!-- end -->",
+    re.DOTALL,
 )
 
 
@@ -65,6 +71,7 @@ def _block(asked: re.Match[str]) -> str:
         "text": text_of,
         "checks": lambda _: checks_table(CHECKS),
         "laws": laws_table,
+        "reasons": lambda first: reasons_table(int(first)),
     }
     content = kinds[asked["kind"]](what)
     return f"<!-- {asked['kind']} of {what} -->\n\n{content}\n\n<!-- end -->"
@@ -133,6 +140,41 @@ def laws_table(what: str) -> str:
     return "\n".join(lines)
 
 
+def reasons_table(first: int) -> str:
+    """Return a table of a hundred reasons, notes left out.
+
+    :param first: their first number.
+    """
+    lines = ["| code | sentence | what is behind it, and what to do |", "|---|---|---|"]
+    for code in Code:
+        row = code.row
+        if first <= code < first + 100 and row.meaning:
+            remedy = row.remedy and f" {row.remedy[0].upper()}{row.remedy[1:]}."
+            cells = (f"{code} `{code.name}`", f"`{row.found}`", f"{row.meaning}{remedy}")
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def reason_file() -> str:
+    """Return Reason.msg, with a constant for each reason."""
+    lines = [
+        "# Why something ended, failed or was refused, for programs; the sentence for people",
+        "# stands with it. tools/fill_docs.py writes this file from relay_autotune/reasons.py.",
+        "#",
+        "# A number keeps its meaning for ever. Up to 99: none, or without a code; from 100 on:",
+        "# the experiment ended it, or a note to that; from 200 on: something outside of it did;",
+        "# from 300 on: a tune cannot start; from 400 on: model and gains; from 500 on: a",
+        "# verification; from 900 on: a defect.",
+        "",
+        "uint16 code      # one of the constants below; another one: a newer node has it",
+        "string[] names   # of its values, shape (n,)",
+        "string[] values  # numbers in full, names and words, shape (n,)",
+        "",
+        *(f"uint16 {code.name} = {code}" for code in Code),
+    ]
+    return "\n".join(lines) + "\n"
+
+
 def limit_text(check: Check, limit: float) -> str:
     """Return a limit with its unit; a dash if there is none.
 
@@ -199,14 +241,18 @@ def yaml_value(value: object) -> str:
 
 
 def main() -> int:
-    """Fill all pages, and write the parameter file."""
-    contents = {page: filled(page.read_text()) for page in PAGES}
-    contents[PARAMETER_FILE] = parameter_file()
-    for page, after in contents.items():
-        before = page.read_text() if page.exists() else ""
+    """Fill all pages, and write the files that follow from the code."""
+    # The pages have the text of the first two.
+    written: list[tuple[Path, Callable[[], str]]] = [
+        (PARAMETER_FILE, parameter_file),
+        (REASON_FILE, reason_file),
+        *((page, partial(lambda page: filled(page.read_text()), page)) for page in PAGES),
+    ]
+    for file, text in written:
+        before, after = file.read_text() if file.exists() else "", text()
         if after != before:
-            page.write_text(after)
-            print(f"filled {page.relative_to(ROOT)}")
+            file.write_text(after)
+            print(f"filled {file.relative_to(ROOT)}")
     return 0
 
 

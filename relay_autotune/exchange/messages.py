@@ -10,6 +10,7 @@ rclpy message or one decoded from a bag, so a live node and a replay read a reco
 from __future__ import annotations
 
 import array
+import contextlib
 import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,7 @@ from relay_autotune.errors import (
 from relay_autotune.exchange.fields import float64_array, of_message, to_message
 from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.quantities import Quantity
+from relay_autotune.reasons import Code, Reason, Value, other
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 from relay_autotune.text import visible
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict
@@ -72,6 +74,49 @@ def start_seconds(nanoseconds: int) -> float:
     return seconds + rest * 1e-9
 
 
+def fill_reason(message: Any, reason: Reason) -> None:
+    """Write code and values of a reason into a `Reason` message.
+
+    :param message: the message to fill.
+    :param reason: its notes are left out.
+    """
+    message.code = int(reason.code)
+    message.names = [name for name, _ in reason.facts]
+    message.values = [str(value) for _, value in reason.facts]
+
+
+def reason_from_message(message: Any, said: str = "", notes: Iterable[Any] = ()) -> Reason:
+    """Read a `Reason` message.
+
+    :param message: the message; None, as a recording of before it was there has: a code that
+        says nothing.
+    :param said: the sentence that came with it.
+    :param notes: further messages of this kind, that belong to it.
+    """
+    said = visible(said)
+    if message is None or int(message.code) == Code.NONE:
+        return other(said)
+    known = int(message.code) in set(Code)
+    code = Code(int(message.code)) if known else Code.OTHER
+    facts = [
+        (visible(name), _value_of(text))
+        for name, text in zip(message.names, message.values, strict=False)
+    ]
+    if not known:
+        facts.append(("number", int(message.code)))
+    if not said:
+        # Values of another node need not be those that the table's sentence wants.
+        said = ", ".join([code.name.lower().replace("_", " "), *(f"{n} {v}" for n, v in facts)])
+    return Reason(code, tuple(facts), tuple(map(reason_from_message, notes)), said)
+
+
+def _value_of(text: str) -> Value:
+    for kind in (int, float):
+        with contextlib.suppress(ValueError):
+            return kind(text)
+    return visible(text)
+
+
 def fill_settings(message: Any, settings: RelaySettings | None) -> None:
     """Write the relay's settings into a `RelaySettings` message.
 
@@ -106,6 +151,10 @@ def fill_experiment(message: Any, record: Record, *, arrays: bool = True) -> Non
     message.experiment_id = record.experiment_id
     message.outcome = int(record.outcome)
     message.reason = record.reason
+    fill_reason(message.why, record.why)
+    for note in record.why.notes:
+        message.notes.append(type(message.why)())
+        fill_reason(message.notes[-1], note)
     fill_settings(message.settings, record.settings)
     message.noise_std = float(record.noise_std)
     message.lost_samples = int(record.lost_samples)
@@ -142,6 +191,9 @@ def record_from_message(message: Any) -> Record:
         cycle_start=tuple(int(i) for i in message.cycle_start),
         outcome=outcome,
         reason=visible(str(message.reason)),
+        why=reason_from_message(
+            getattr(message, "why", None), message.reason, getattr(message, "notes", ())
+        ),
         experiment_id=visible(str(message.experiment_id)),
         start=start_seconds(stamp_nanoseconds(message.header.stamp)),
         lost_samples=int(message.lost_samples),
@@ -281,6 +333,16 @@ def _fill_envelope(
     message.final = bool(final)
     message.verdict = int(judgement.verdict)
     message.verdict_reason = judgement.reason
+    fill_reason(message.verdict_why, _why_of(judgement))
+
+
+def _why_of(judgement: Judgement) -> Reason:
+    worst = judgement.worst
+    if judgement.refused or worst is None:
+        return other(judgement.reason)
+    return Code.CHECK_FAILED(
+        sentence=worst.said, check=worst.name, value=worst.value, limit=worst.limit
+    )
 
 
 def finding_from_message(message: Any) -> FitProgress:

@@ -18,6 +18,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import RecordError
 from relay_autotune.quantities import LARGEST, result_field
+from relay_autotune.reasons import NONE, Reason
 
 # Difference of equal slopes, relative to the steepest one.
 _STRAIGHT = 1e-12
@@ -318,6 +319,7 @@ class Record:
         that was not finished, so m + 1 entries bound m whole cycles.
     :param outcome: how the experiment ended.
     :param reason: why it ended so, a sentence for people.
+    :param why: the same for programs; its code is NONE where that is not known.
     :param experiment_id: the id that every message of the experiment carries.
     :param start: time of the first sample [s since the epoch]; 0: unknown.
     :param lost_samples: samples that the middleware is known to have lost.
@@ -342,6 +344,7 @@ class Record:
     cycle_start: tuple[int, ...] = ()
     outcome: Outcome = Outcome.UNKNOWN
     reason: str = ""
+    why: Reason = NONE
     experiment_id: str = ""
     start: float = 0.0
     lost_samples: int = 0

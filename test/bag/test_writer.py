@@ -212,6 +212,7 @@ def test_definitions_come_with_all_they_need(tmp_path):
     blocks = text.split("=" * 80 + "\nMSG: ")
     assert [block.splitlines()[0] for block in blocks[1:]] == [
         "std_msgs/msg/Header",
+        "relay_autotune_msgs/msg/Reason",
         "relay_autotune_msgs/msg/RelaySettings",
         "builtin_interfaces/msg/Time",
     ]

@@ -50,7 +50,9 @@ def test_a_doubt_marks_the_gains_in_table_document_page_and_message():
     assert verdict_of(case).text.startswith("doubtful gains")
     assert checks_of(case)[-1].mark == "!"
     assert said in page([replace(case, record=None, cycles=(), models_around=())])
-    message = SimpleNamespace(header=SimpleNamespace(stamp=SimpleNamespace()))
+    message = SimpleNamespace(
+        header=SimpleNamespace(stamp=SimpleNamespace()), verdict_why=SimpleNamespace()
+    )
     fill_gains(message, found.best_gains, judgement=found.judgement)
     assert (message.verdict, message.verdict_reason) == (Verdict.DOUBTFUL, said)
 

@@ -109,7 +109,7 @@ def test_json_table_and_message_carry_all_of_it(record, models):
     assert "N1 = " in text
     assert "% off" in text
     header = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0))
-    message = SimpleNamespace(header=header)
+    message = SimpleNamespace(header=header, verdict_why=SimpleNamespace())
     fill_transfer_function(message, models[2])
     assert message.validation_shape == models[2].validation.shape
     assert list(message.point_std) == [p.std for p in models[2].points]

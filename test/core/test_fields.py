@@ -246,7 +246,7 @@ def value_of(kind):
 
 
 # What the nodes write beside results: whose they are, and the samples.
-ENVELOPE = {"header", "experiment_id", "final", "verdict", "verdict_reason"}
+ENVELOPE = {"header", "experiment_id", "final", "verdict", "verdict_reason", "verdict_why"}
 SAMPLES = {"settings", "lead_in", "time", "measurement", "command"}
 
 

@@ -35,6 +35,7 @@ from relay_autotune.identification.result import Combination, FitReport, Identif
 from relay_autotune.loop.gains import Gains
 from relay_autotune.process.structures import IPDT, UNSTABLE_FOPDT, GivenModel
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.reasons import Code, other
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 
 SETTINGS = RelaySettings(
@@ -54,7 +55,13 @@ def header() -> SimpleNamespace:
 
 
 def empty_message() -> SimpleNamespace:
-    return SimpleNamespace(header=header(), settings=SimpleNamespace(amplitude=0.0))
+    return SimpleNamespace(
+        header=header(),
+        settings=SimpleNamespace(amplitude=0.0),
+        why=SimpleNamespace(),
+        notes=[],
+        verdict_why=SimpleNamespace(),
+    )
 
 
 def record(n: int = 40, **changes: Any) -> Record:
@@ -70,6 +77,7 @@ def record(n: int = 40, **changes: Any) -> Record:
         "cycle_start": (10, 20, 30),
         "outcome": Outcome.COMPLETED,
         "reason": "three cycles",
+        "why": Code.SILENT_SENSOR(Code.NOTE_LOST(samples=2), topic="/level", silence=0.1 + 0.2),
         "experiment_id": "one",
         "start": 1.7e9 + 0.1234567,
         "lost_samples": 2,
@@ -82,6 +90,9 @@ def assert_same(a: Record, b: Record) -> None:
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
     for name in ("settings", "cycle_start", "outcome", "reason", "experiment_id", "start"):
         assert getattr(a, name) == getattr(b, name), name
+    # The sentence travels beside the code.
+    assert (a.why.code, a.why.facts) == (b.why.code, b.why.facts)
+    assert [note.code for note in a.why.notes] == [note.code for note in b.why.notes]
     assert a.lost_samples == b.lost_samples
     assert a.noise_std == b.noise_std or (math.isnan(a.noise_std) and math.isnan(b.noise_std))
 
@@ -91,6 +102,13 @@ def test_a_record_comes_back_to_the_last_bit() -> None:
     fill_experiment(message, record())
     assert isinstance(message.time, array.array)
     assert_same(record_from_message(message), record())
+
+
+def test_a_recording_of_before_has_the_sentence_of_its_reason_alone() -> None:
+    message = empty_message()
+    fill_experiment(message, record())
+    del message.why, message.notes
+    assert record_from_message(message).why == other("three cycles")
 
 
 def test_a_record_without_relay_comes_back() -> None:
@@ -207,7 +225,7 @@ def identification(model: TransferFunction) -> Identification:
     ],
 )
 def test_a_model_comes_back(model: TransferFunction) -> None:
-    message = SimpleNamespace(header=header())
+    message = empty_message()
     fill_transfer_function(message, identification(model), experiment_id="one", stamp_ns=5)
     back = transfer_function_from_message(message)
     s = 1j * np.geomspace(1e-3, 1e2, 50)
@@ -223,7 +241,7 @@ def test_a_model_comes_back(model: TransferFunction) -> None:
 
 def test_a_complex_pair_is_left_to_the_polynomials() -> None:
     model = TransferFunction.from_polynomials([1.0], [4.0, 0.8, 1.0], 0.5)
-    message = SimpleNamespace(header=header())
+    message = empty_message()
     fill_transfer_function(message, identification(model))
     assert list(message.time_constants) == []
     assert list(message.denominator) == pytest.approx([4.0, 0.8, 1.0])
@@ -233,7 +251,7 @@ MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 
 
 def model_message(**changes: Any) -> SimpleNamespace:
-    message = SimpleNamespace(header=header())
+    message = empty_message()
     fill_transfer_function(message, identification(MODEL), experiment_id="one")
     return SimpleNamespace(**(vars(message) | changes))
 
@@ -267,7 +285,7 @@ GAINS = Gains(
 
 
 def gains_message(**changes: Any) -> SimpleNamespace:
-    message = SimpleNamespace(header=header())
+    message = empty_message()
     fill_gains(message, GAINS, experiment_id="one")
     return SimpleNamespace(**(vars(message) | changes))
 

@@ -14,8 +14,8 @@ ROOT = Path(__file__).resolve().parents[2]
 # From the ground up. A package imports itself and those on floors below; two on one floor do not
 # know each other.
 FLOORS = (
-    {"errors", "threads", "arrays"},
-    {"quantities", "text"},
+    {"errors", "threads", "arrays", "text"},
+    {"quantities", "reasons"},
     {"record", "verdict"},
     {"process"},
     {"experiment"},
@@ -33,8 +33,8 @@ FLOORS = (
 )
 FLOOR_OF = {name: number for number, names in enumerate(FLOORS) for name in sorted(names)}
 # What brings ROS in; all else runs without it.
-NUMERIC = ("errors", "quantities", "record", "process", "experiment", "identification", "loop",
-           "control", "tuning", "result", "analysis", "parts", "exchange")  # fmt: skip
+NUMERIC = ("errors", "reasons", "quantities", "record", "process", "experiment", "identification",
+           "loop", "control", "tuning", "result", "analysis", "parts", "exchange")  # fmt: skip
 FOREIGN = {"numpy", "scipy"}
 
 

@@ -55,8 +55,13 @@ def _built(store: Any, type_name: str, value: Any) -> Any:
         if kind.name == "NAME":
             item = _built(store, what, item)
         elif kind.name in ("ARRAY", "SEQUENCE"):
-            base = what[0][1][0]
-            item = list(item) if base == "string" else np.asarray(item, dtype=base)
+            inner, held = what[0]
+            if inner.name == "NAME":
+                item = [_built(store, held, each) for each in item]
+            elif held[0] == "string":
+                item = list(item)
+            else:
+                item = np.asarray(item, dtype=held[0])
         fields[name] = item
     return store.types[type_name](**fields)
 
@@ -68,6 +73,8 @@ def blank_experiment() -> SimpleNamespace:
         experiment_id="",
         outcome=0,
         reason="",
+        why=SimpleNamespace(code=0, names=[], values=[]),
+        notes=[],
         settings=SimpleNamespace(
             setpoint=0.0,
             baseline=0.0,
