@@ -25,7 +25,7 @@ HERE = Path(__file__).resolve().parent
 GROUPS = {
     "identification": (
         *("accuracy", "target_spread", "structure_choice", "coverage", "coloured_noise"),
-        *("unmodelled", "ah_batch", "confident"),
+        *("unmodelled", "ah_batch", "confident", "first_tries", "limits"),
     ),
     "design": ("design_known", "design_identified", "laws"),
     "time": (

@@ -8,8 +8,11 @@ The runs are nightly ones: they take minutes and prove the benchmarks, not the p
 
 from __future__ import annotations
 
+import ast
 import importlib
+import importlib.util
 import json
+import math
 import re
 import subprocess
 import sys
@@ -19,6 +22,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from relay_autotune.loop.analysis import ms_on
+from relay_autotune.loop.gains import Controller
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
@@ -49,6 +54,8 @@ QUICK = {
     "coverage": ("--quick",),
     "ah_batch": ("--quick",),
     "verdicts": ("--quick",),
+    "first_tries": ("--quick",),
+    "limits": ("--quick",),
     "design_known": ("--quick",),
     "laws": ("--quick",),
     "design_identified": ("--quick",),
@@ -214,3 +221,49 @@ def test_recordings_in_a_folder_are_judged_by_the_judge_in_it(tmp_path: Path) ->
     assert ["made", "identifiable", "good", "trusted", "fopdt", "-"] in [c[:6] for c in cells]
     assert ["good, of the identifiable", "1 of 1"] in cells
     assert ["all gains of a half, Ms at most 2 on the other half's model", "2 of 2"] in cells
+
+
+def test_the_truth_of_first_tries_is_that_of_the_exact_loop() -> None:
+    first_tries = importlib.import_module("first_tries")
+    gain, slow, fast = 2.0, 8.0, 3.0
+
+    def flow(x: np.ndarray, u: float) -> np.ndarray:
+        return np.array([(gain * u - x[0]) / slow, (x[0] - x[1]) / fast])
+
+    loop = first_tries.Loop(flow, 0.5, (0.0, 1.0), 0.5, (1.0, 1.0), delay=1.0)
+    (truth,) = loop.truths()
+    late = loop.delay + (0.5 + first_tries.ANSWER) * loop.period
+    model = TransferFunction.sopdt(gain, (slow, fast), late)
+    for kc, ti in ((0.8, 10.0), (1.6, 6.0)):
+        gains = Controller(kc, ti)
+        assert truth.ms(gains) == pytest.approx(ms_on(gains, model), rel=1e-3)
+    assert math.isinf(truth.ms(Controller(20.0, 2.0)))
+    assert 0.02 < truth.best_integral() < 0.2
+
+
+def test_a_limit_is_noticed_where_its_half_or_double_decides() -> None:
+    limits = importlib.import_module("limits")
+    source = "_MOST = 4.0\n\ndef beyond(x):\n    return abs(x) > _MOST\n"
+    tree = limits.Instrument({"_MOST": "here:_MOST"}).visit(ast.parse(source).body[1])
+    reached = limits.Reached(record=7)
+    room = {"_MOST": 4.0, limits._USE: reached.use, limits._DECIDE: reached.decide}
+    module = ast.fix_missing_locations(ast.Module([tree], []))
+    exec(compile(module, "made", "exec"), room)
+    assert [room["beyond"](x) for x in (-9.0, 1.0)] == [True, False]
+    assert reached.used["here:_MOST"] == {7}
+    assert not reached.open["here:_MOST"]
+    assert not room["beyond"](3.0)
+    assert reached.open["here:_MOST"] == {7}
+
+
+def test_the_limits_of_checks_are_found_and_moved() -> None:
+    limits = importlib.import_module("limits")
+    found = {each.name: each for each in limits.limits()}
+    limit = found["risk.doubtful"]
+    assert float(limit.value) > 0.0
+    spec = limits.moved(limit, 2.0).find_spec(limit.module)
+    assert spec is not None
+    table = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(table)
+    (risk,) = [check for check in table.CHECKS if check.name == "risk"]
+    assert risk.doubtful == 2.0 * float(limit.value)
