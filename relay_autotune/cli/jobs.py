@@ -486,9 +486,9 @@ def show(
                 program, parser, options, web=None, web_address=None, export=None, **changed
             )
 
-        return PageModel(case, shaping, first, command)
+        return PageModel(case, shaping, first, command, target=target)
 
     subjects = [subject(case, shaping) for case, shaping in models]
 
-    page = Page(subjects, address_of(options.web_address), target=target)
+    page = Page(subjects, address_of(options.web_address))
     run(page, lambda url: say(program, f"the page is at {url} until Ctrl-C"))

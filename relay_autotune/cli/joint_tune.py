@@ -9,7 +9,6 @@ import argparse
 import json
 import math
 import shlex
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
@@ -18,6 +17,7 @@ import yaml
 
 from relay_autotune.cli.apply_gains import apply_at, beside
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say
+from relay_autotune.cli.loops import Loop, Steps
 from relay_autotune.cli.own_nodes import (
     PROGRAM,
     START_WITHIN,
@@ -28,8 +28,8 @@ from relay_autotune.cli.own_nodes import (
     ranges,
     ros_arguments,
 )
-from relay_autotune.cli.terminal import Working, agrees, asked, number_of, pair_of, tell, width
-from relay_autotune.cli.tune_view import check_lines
+from relay_autotune.cli.settings import Answers
+from relay_autotune.cli.terminal import Working, agrees, tell
 from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.export import Target
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
@@ -50,7 +50,6 @@ from relay_autotune.nodes.ros2_control import (
     joint_loop,
     put_gains,
 )
-from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune_msgs.action import Tune
 
 _JOINT_STATES = "joint_states"
@@ -62,26 +61,28 @@ _PATIENCE = 2.0
 _PROOF = 0.05
 
 
-class JointTune:
+class JointLoop(Loop):
     """A joint that is to be tuned.
 
-    :param client: a node of the graph; it goes on where a node of this command is lost.
-    :param options: with the flags of `add_joint` and `add_new_loop`; the namespace of the nodes is
-        set in it.
+    :param robot: a node of the graph; it goes on where a node of this command is lost.
+    :param options: of the command line; the namespace of the nodes is set in it.
     :raises LoopError: if the loop is not there, or something is not known and nobody can be asked.
     """
 
-    def __init__(self, client: LoopClient, options: argparse.Namespace) -> None:
-        self._client, self._options = client, options
+    has_own_nodes = True
+
+    def __init__(self, robot: LoopClient, options: argparse.Namespace) -> None:
+        self._client, self.options = robot, options
+        self.answers, self.nodes = Answers(options), OwnNodes()
         self._forward: ManagedController | None = None
         self._former: tuple[str, ...] = ()
         with Working(f"looking at {options.controller}"):
             space, slash, controller = options.controller.rpartition("/")
             within = f"/{space.strip('/')}".rstrip("/") if slash else None
             self._manager = ControllerManager(
-                client, options.controller_manager, within, options.wait
+                robot, options.controller_manager, within, options.wait
             )
-            self._loop = joint_loop(client, self._manager, controller, options.joint)
+            self._loop = joint_loop(robot, self._manager, controller, options.joint)
             if options.open:
                 loaded = self._manager.controllers()
                 self._forward = forwarding(
@@ -100,18 +101,25 @@ class JointTune:
                 f"{loop.controller} has no reference for {loop.joint} yet: publish one on "
                 f"{loop.reference_topic}, and wait until the joint rests there"
             )
-        self._within_from = "--within"
-        self._within = options.within
-        if self._within is None and loop.within is not None:
-            self._within, self._within_from = list(loop.within), "robot_description"
-        if self._within is None:
-            what = f"lowest and highest {loop.measured} that {loop.joint} may have [y]"
-            self._within, self._within_from = asked(what, "--within", "", "-5 5", pair_of), "typed"
+        answers = self.answers
+        if options.within is None and loop.within is not None:
+            answers.take("within", list(loop.within), "robot_description")
+        else:
+            answers.measured = loop.state.feedback
+            what = f"lowest and highest {loop.measured} that {loop.joint} may have"
+            answers.ask("within", what, "-5 5")
         self._baseline = loop.state.output if options.at is None else options.at
-        if options.open and not math.isfinite(self._baseline):
-            what = f"present {loop.commanded} of {loop.joint}, at which it rests [u]"
-            self._baseline = asked(what, "--at", "", "0", number_of)
-        self._command_within = self._range() if options.open else None
+        if options.open:
+            if not math.isfinite(self._baseline):
+                what = f"present {loop.commanded} of {loop.joint}, at which it rests"
+                answers.ask("at", what, "0")
+                self._baseline = options.at
+            self._know_range()
+
+    @property
+    def title(self) -> str:
+        """The name of the loop for people."""
+        return f"{self._loop.joint} of {self._loop.controller}"
 
     def _why_not_closed(self) -> str:
         loop = self._loop
@@ -136,7 +144,11 @@ class JointTune:
     # What is to happen.
 
     def plan(self) -> list[str]:
-        """Return the plan, as lines of a checklist."""
+        """Return the plan, as lines of a checklist, some seconds after the first look.
+
+        :raises LoopError: if another robot was found meanwhile, which may be the one meant.
+        """
+        self._manager.require_alone()
         loop = self._loop
         lines = [
             ChecklistLine(Mark.OK, name, told)
@@ -155,18 +167,10 @@ class JointTune:
         lines += [ChecklistLine(Mark.NOTE, *note) for note in self._notes()]
         return list(map(str, lines))
 
-    def show(self) -> None:
-        """Print the plan, some seconds after the first look.
-
-        :raises LoopError: if another robot was found meanwhile, which may be the one meant.
-        """
-        self._manager.require_alone()
-        print("\n".join(check_lines(self.plan(), width())), file=sys.stderr, flush=True)
-
     def _moves(self) -> Iterator[tuple[str, str]]:
         loop = self._loop
-        low, high = self._within
-        limits = f"{low:g} to {high:g} ({self._within_from})"
+        low, high = self.options.within
+        limits = f"{low:g} to {high:g} ({self.answers.source('within')})"
         others = [each for each in loop.joints if each != loop.joint]
         if self._forward is None:
             yield "moves", f"the reference of {loop.joint} about {loop.state.reference:.6g}"
@@ -190,7 +194,7 @@ class JointTune:
             yield "holds", ", ".join(beside)
 
     def _applied(self) -> str:
-        if self._options.keep_gains:
+        if self.options.keep_gains:
             return "stay, whatever is found (--keep-gains)"
         why = self._loop.why_not_moved
         return f"{self._places} at once, " + (
@@ -272,16 +276,16 @@ class JointTune:
 
     # The loop while it is tuned.
 
-    def nodes(self) -> OwnNodes:
-        """Return the nodes that tune it."""
-        loop, options = self._loop, self._options
+    def arguments(self) -> dict[str, list[str]]:
+        """Return the arguments for ROS of the nodes that tune it."""
+        loop, options = self._loop, self.options
         topics, values = self._opened_ends() if options.open else self._closed_ends()
         values["amplitude"] = options.amplitude
         nodes = {"relay_node": ros_arguments(self._space, topics, values)}
         if not options.record_only:
             design = {"law": loop.law, "sample_period": loop.period}
             nodes["identifier_node"] = ros_arguments(self._space, {}, design)
-        return OwnNodes(nodes)
+        return nodes
 
     def _closed_ends(self) -> tuple[dict[str, str], dict[str, Any]]:
         """Return topics and parameters of a relay_node that moves the reference."""
@@ -290,7 +294,7 @@ class JointTune:
             "relay_on": "setpoint",
             "setpoint": self._loop.state.reference,
             # The levels are references, which have the limits of the measurement.
-            **ranges(None, self._within),
+            **ranges(None, self.options.within),
         }
 
     def _at_controller(self) -> tuple[dict[str, str], dict[str, Any]]:
@@ -303,12 +307,12 @@ class JointTune:
             "command_type": COMMAND_TYPE,
             "command_field": loop.reference_field,
             "command_message": json.dumps(loop.reference_alone),
-            **ranges(self._within, None),
+            **ranges(self.options.within, None),
         }
 
     def _opened_ends(self) -> tuple[dict[str, str], dict[str, Any]]:
         assert self._forward is not None
-        loop, options, client = self._loop, self._options, self._client
+        loop, options, client = self._loop, self.options, self._client
         kind, field = _JOINT_STATE, f"{loop.measured}[{loop.joint}]"
         topic = options.measurement or self._manager.node_of(_JOINT_STATES)
         found = client.kind_of(topic, options.wait, published=True)
@@ -327,7 +331,7 @@ class JointTune:
             "command_field": f"data[{place}]",
             "command_message": json.dumps(f"{{data: {held}}}"),
             "baseline": self._baseline,
-            **ranges(self._within, self._command_within),
+            **ranges(self.options.within, self.options.command_within),
             "use_sim_time": loop.is_simulated,
         }
         if loop.measured == "position" and loop.commanded != "position":
@@ -335,19 +339,16 @@ class JointTune:
             values |= {"process_type": "integrating", "start_without_hold": True}
         return topics, values
 
-    def _range(self) -> list[float] | None:
-        """Return the limits of the command, asked for where the amplitude is found by them."""
-        loop, options = self._loop, self._options
-        if options.command_within is not None:
-            return list(options.command_within)
+    def _know_range(self) -> None:
+        """Take the limits of the command, asked for where the amplitude is found by them."""
+        loop, options = self._loop, self.options
         told = [loop.clamps, loop.command_within or (-math.inf, math.inf)]
         found = [max(low for low, _ in told), min(high for _, high in told)]
-        if all(map(math.isfinite, found)):
-            return found
-        if options.amplitude:
-            return None
-        what = f"lowest and highest {loop.commanded} of {loop.joint} [u]"
-        return list(asked(what, "--command-within", "", "-2 2", pair_of))
+        if options.command_within is None and all(map(math.isfinite, found)):
+            options.command_within = found
+        elif not options.amplitude:
+            what = f"lowest and highest {loop.commanded} of {loop.joint}"
+            self.answers.ask("command_within", what, "-2 2")
 
     def _commands_beside(self, forward: ManagedController) -> list[float]:
         """Return what each interface of the forwarding controller is told; NaN: the joint."""
@@ -357,7 +358,7 @@ class JointTune:
             for dof, state in zip(loop.dofs, loop.states, strict=True)
         }
         others = [name for name in forward.needs if name != loop.interface]
-        if self._options.command_message and others:
+        if self.options.command_message and others:
             return self._given_beside(forward)
         told = {loop.interface: math.nan}
         for name in others:
@@ -378,11 +379,11 @@ class JointTune:
 
     def _given_beside(self, forward: ManagedController) -> list[float]:
         with suppress(yaml.YAMLError, TypeError, ValueError, KeyError):
-            data = [float(v) for v in yaml.safe_load(self._options.command_message)["data"]]
+            data = [float(v) for v in yaml.safe_load(self.options.command_message)["data"]]
             if len(data) == len(forward.needs):
                 return data
         raise SelectionError(
-            f"--command-message is {self._options.command_message}, expected "
+            f"--command-message is {self.options.command_message}, expected "
             f"'{{data: [...]}}' with {len(forward.needs)} numbers: {', '.join(forward.needs)}"
         )
 
@@ -414,10 +415,12 @@ class JointTune:
             why_lost = self._manager.still_active(forward.name if forward else loop.controller)
 
             def why_over(state: int) -> str:
-                if state <= Tune.Feedback.STATE_RELAY:
-                    return why_lost()
-                stack.close()
-                return ""
+                if state <= Tune.Feedback.STATE_RELAY and (why := why_lost()):
+                    return why
+                if state > Tune.Feedback.STATE_RELAY:
+                    stack.close()
+                # A relay_node that is lost cannot be asked to end the tune.
+                return self.nodes.why_lost("identifier_node")
 
             try:
                 yield why_over
@@ -497,11 +500,6 @@ class JointTune:
         """Where exported gains go."""
         return Target(self._loop.node, self._loop.dof, is_set_up=True)
 
-    @property
-    def applies(self) -> bool:
-        """Whether the gains go to the controller."""
-        return not self._options.keep_gains
-
     def present(self) -> Controller | None:
         """Return the gains that the joint's controller has; None: it has none.
 
@@ -512,18 +510,27 @@ class JointTune:
         found = {gain: values[place] for gain, place in places.items()}
         return controller_of(found) if found["p"] else None
 
-    def apply(self, client: TuneClient, nodes: OwnNodes, doubt: str) -> int:
+    def first(self) -> Steps:
+        """Return how to activate its controller before another tune, if it is not active."""
+        with suppress(LoopError):
+            if typed := self.activation():
+                return [("activate its controller", typed)]
+        return []
+
+    def apply(self, doubt: str) -> int | None:
         """Offer the gains to the controller, verify them, and return the exit status.
 
-        :param client: with the result of the tune.
-        :param nodes: of this command.
         :param doubt: why they are doubtful; empty: they are trusted.
+        :return: None: the controller keeps the gains that it has.
         """
-        if doubt and self._options.yes:
+        if self.options.keep_gains:
+            return None
+        print()
+        if doubt and self.options.yes:
             raise LoopError(f"the gains are doubtful, so that --yes does not apply them: {doubt}")
         loop = self._loop
         if loop.why_not_moved:
-            return self._set(client)
+            return self._set()
         places = ",".join(map("{}:{}".format, *zip(*loop.places.items(), strict=True)))
         topics, values = self._at_controller()
         values |= {
@@ -536,32 +543,32 @@ class JointTune:
             if math.isfinite(clamp):
                 values[name] = clamp
         # Not before, since relay_node refuses a second publisher of the reference.
-        nodes.start("controller_node", ros_arguments(self._space, topics, values))
+        self.nodes.start("controller_node", ros_arguments(self._space, topics, values))
         try:
             return apply_at(
-                own_node(self._options, "controller_node"),
-                client,
+                own_node(self.options, "controller_node"),
+                self.client,
                 doubtful=bool(doubt),
-                yes=self._options.yes,
+                yes=self.options.yes,
                 patience=START_WITHIN,
             )
         except GoneError:
             # It would have taken its step back.
-            nodes.end("controller_node")
+            self.nodes.end("controller_node")
             self._put_back()
             raise
 
-    def _set(self, tuned: TuneClient) -> int:
+    def _set(self) -> int:
         """Set the gains of a controller whose references nobody can move; return the status."""
         loop, client = self._loop, self._client
-        found = tuned.result
+        found = self.client.result
         gains = gains_from_message(found.gains)
         model = transfer_function_from_message(found.transfer_function)
         before = client.values(loop.node, list(loop.places.values()))
         wanted = {place: float(getattr(gains, name)) for name, place in loop.places.items()}
         print("\n".join(beside(self.present(), gains, model)))
         question = f"Set {self._places} of {loop.node}, without a step that verifies them?"
-        if not agrees(question, yes=self._options.yes):
+        if not agrees(question, yes=self.options.yes):
             say(PROGRAM, "nothing was changed")
             return NOTHING_FOUND
         put_gains(client, loop.node, wanted, before)
@@ -586,7 +593,7 @@ class JointTune:
         :param settling_time: predicted [s].
         """
         loop = self._loop
-        low, high = self._within
+        low, high = self.options.within
         now = [
             at if math.isfinite(at := self._position_of(joint)) else state.feedback
             for joint, state in zip(loop.joints, loop.states, strict=True)

@@ -384,21 +384,33 @@ def agreed_step(question: str, step: float, allowed: StepRange) -> float:
         print("\n".join(broken(told, width())), file=sys.stderr)
 
 
-def asked(what: str, flag: str, known: str, example: str, read: Callable[[str], Any]) -> Any:
-    """Ask for a value until it can be read.
+def asked(
+    what: str,
+    flag: str,
+    known: str,
+    example: str,
+    read: Callable[[str], Any],
+    why_impossible: Callable[[Any], str] = lambda _: "",
+) -> Any:
+    """Ask for a value until it can be read and can be.
 
     :param what: what is asked for, with its unit.
     :param flag: the flag that would have given it.
     :param known: the value that Enter takes; empty: none.
     :param example: what may be typed.
     :param read: returns the value of a text; None: it has none.
+    :param why_impossible: tells why a value cannot be; empty: it can.
     """
     _require_somebody(flag)
     shown = f"{what}, such as {example}" + f" [{known}]: " * bool(known) + ": " * (not known)
-    while (value := read(_input(shown) or known)) is None:
-        found = "two numbers, the lower one first" if read is pair_of else "a number"
-        print(f"expected {found}, such as {example}", file=sys.stderr)
-    return value
+    while True:
+        value = read(_input(shown) or known)
+        if value is None:
+            found = "two numbers, the lower one first" if read is pair_of else "a number"
+            said = f"expected {found}, such as {example}"
+        elif not (said := why_impossible(value)):
+            return value
+        print("\n".join(broken(said, width())), file=sys.stderr)
 
 
 def _require_somebody(flag: str) -> None:

@@ -31,23 +31,15 @@ from relay_autotune.cli.arguments import (
     guarded_in_graph,
     say,
 )
-from relay_autotune.cli.own_nodes import (
-    PROGRAM,
-    START_WITHIN,
-    add_joint,
-    add_new_loop,
-    is_new_loop,
-    is_of_joint,
-    nodes_for,
-    own_namespace,
-    with_flags,
-)
+from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN, own_namespace
+from relay_autotune.cli.settings import Kind, add_joint, add_settings, kind_of
 from relay_autotune.cli.terminal import Help, Working, agrees, require_new, width
 from relay_autotune.cli.tune_view import TICK, Shown, check_lines, follow
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
 
 if TYPE_CHECKING:
+    from relay_autotune.cli.loops import Loop
     from relay_autotune.nodes.loop_client import LoopClient
     from relay_autotune.nodes.tune_client import TuneClient
 
@@ -63,6 +55,26 @@ def main(args: Sequence[str] | None = None) -> int:
     own, ros = _apart(given)
     parser = _parser()
     options = parser.parse_args(own)
+    _require_consistent(parser, options)
+    options.typed = given
+    if (options.measurement and options.command) or options.joint:
+        # At once, since what follows takes a second to load.
+        what = (options.joint or options.measurement, options.controller or options.command)
+        told = f"looking at {what[0]} and {what[1]}; nothing is commanded yet"
+        print(told, file=sys.stderr, flush=True)
+    starts = bool(options.measurement or options.joint)
+    with Working("loading what talks to the nodes") if starts else nullcontext():
+        import relay_autotune.nodes.tune_client  # noqa: F401  see run_command
+
+    def work(graph: ExitStack) -> int:
+        with ExitStack() as nodes:
+            return Session(parser, options, ros, graph, nodes).run()
+
+    return guarded_in_graph(PROGRAM, work)
+
+
+def _require_consistent(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """End the program if some options contradict each other."""
     if options.amplitude < 0.0 or options.wait < 0.0:
         parser.error("--amplitude and --wait are at least 0")
     if options.sample_period is not None and options.sample_period <= 0.0:
@@ -79,17 +91,6 @@ def main(args: Sequence[str] | None = None) -> int:
             "--verify proves the gains of a tune that prints them: leave out --web, --json, "
             "--record-only and --dry-run"
         )
-    options.typed = given
-    if (options.measurement and options.command) or options.joint:
-        # At once, since what follows takes a second to load.
-        what = (options.joint or options.measurement, options.controller or options.command)
-        told = f"looking at {what[0]} and {what[1]}; nothing is commanded yet"
-        print(told, file=sys.stderr, flush=True)
-    starts = bool(options.measurement or options.joint)
-    with Working("loading what talks to the nodes") if starts else nullcontext():
-        import relay_autotune.nodes.tune_client  # noqa: F401  see run_command
-
-    return guarded_in_graph(PROGRAM, lambda graph: _tune(options, ros, graph))
 
 
 def _apart(given: list[str]) -> tuple[list[str], list[str]]:
@@ -136,152 +137,222 @@ def _parser() -> argparse.ArgumentParser:
         help="write a report: .html, or a picture: .png, .svg or .pdf",
     )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
-    add_new_loop(parser)
+    add_settings(parser)
     add_joint(parser)
     add_web(parser, "serve a page on which tunes are started, watched and ended, until Ctrl-C")
     return parser
 
 
-def _tune(options: argparse.Namespace, ros: list[str], graph: ExitStack) -> int:
-    interrupted: list[int] = []
+class Signals:
+    """The signals that end a tune in order: they are only noted.
 
-    def heed(number: int) -> None:
-        signal.signal(number, lambda n, _: interrupted.append(n))
+    An exception could be lost in an import or in a callback of rclpy.
+    """
 
-    # Only note the signal: an exception could be lost in an import or in a callback of rclpy.
-    heed(signal.SIGINT)
-    # Imported here, so that --help does not load rclpy.
-    from relay_autotune.nodes.lifetime import ending_signals, never_wait_for
-    from relay_autotune.nodes.loop_client import LoopClient
-    from relay_autotune.nodes.tune_client import TuneClient
+    def __init__(self) -> None:
+        self.came: list[int] = []
+        """Those that have come."""
+        self._noted: set[int] = set()
 
-    if options.report:
-        from relay_autotune.cli.report import check_output
+    def note(self, *numbers: int) -> None:
+        """Only note these signals from now on."""
+        for number in numbers:
+            signal.signal(number, lambda n, _: self.came.append(n))
+            self._noted.add(number)
 
-        check_output(PROGRAM, options.report)
-    if options.export:
-        require_new(options.export)
-    if options.web:
-        check_web(options)
-    of_joint = is_of_joint(options)
-    new = of_joint or is_new_loop(options)
+    def obey(self) -> None:
+        """Let a signal end the command at once from now on, and one that has come, now."""
+        for number in self._noted - {signal.SIGINT}:
+            signal.signal(number, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        self._noted.clear()
 
-    def joined(kind: Callable[..., _Client], *arguments: Any) -> _Client:
+    def raise_if_came(self) -> None:
+        """Raise what a signal that has come stands for."""
+        if self.came:
+            raise KeyboardInterrupt
+
+
+class Session:
+    """One run of the command, step by step: look, start, find, agree, tune, conclude.
+
+    :param parser: of the command line.
+    :param options: that it has read; answers are kept there.
+    :param ros: arguments for ROS.
+    :param graph: where the clients end.
+    :param nodes: where the nodes of the command end, before the clients.
+    """
+
+    def __init__(
+        self,
+        parser: argparse.ArgumentParser,
+        options: argparse.Namespace,
+        ros: list[str],
+        graph: ExitStack,
+        nodes: ExitStack,
+    ) -> None:
+        self._parser, self._options, self._ros = parser, options, ros
+        self._graph, self._nodes = graph, nodes
+        self._signals = Signals()
+
+    def run(self) -> int:
+        """Do all steps, and return the exit status."""
+        options, signals = self._options, self._signals
+        signals.note(signal.SIGINT)
+        self._check_files()
+        kind = kind_of(options)
+        if kind is not Kind.NODES:
+            # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.
+            signals.obey()
+            signals.raise_if_came()
+        loops = self._looked_at(kind)
+        deadline = time.monotonic() + self._started(loops)
+        self._find(loops, deadline)
+        loop = loops[0]
+        print("".join(f"{line}\n" for line in check_lines(loop.plan(), width())), end="",
+              file=sys.stderr, flush=True)  # fmt: skip
+        asks = loop.has_own_nodes and not (options.dry_run or options.web)
+        if asks and not self._is_agreed(loop, deadline):
+            return NOTHING_FOUND
+        # Imported here, so that --help does not load rclpy.
+        from relay_autotune.nodes.lifetime import ending_signals
+
+        # Until here nothing has started. Ctrl-Z may stop this command; the tune then continues.
+        signals.note(signal.SIGINT, *(ending_signals() - {signal.SIGTSTP}))
+        signals.raise_if_came()
+        if options.web:
+            from relay_autotune.cli.tune_page import TunePage
+
+            return TunePage(loops, options).run(signals.came)
+        self._tune(loop, deadline)
+        return self._concluded(loop)
+
+    def _check_files(self) -> None:
+        """Refuse what could not be written or served, before any work is done."""
+        options = self._options
+        if options.report:
+            from relay_autotune.cli.report import check_output
+
+            check_output(PROGRAM, options.report)
+        if options.export:
+            require_new(options.export)
+        if options.web:
+            check_web(options)
+
+    def _joined(self, kind: Callable[..., _Client], *arguments: Any) -> _Client:
         try:
             with Working("joining the ROS graph"):
                 found = kind(*arguments)
         except ParameterError as error:
             raise SelectionError(str(error)) from None
-        graph.enter_context(found)
+        self._graph.enter_context(found)
         return found
 
-    with ExitStack() as stack:
-        patience, robot, joint, nodes = options.wait, None, None, None
-        if of_joint:
-            from relay_autotune.cli.joint_tune import JointTune
+    def _looked_at(self, kind: Kind) -> list[Loop]:
+        """Look at the loops, and ask for what is not given."""
+        from relay_autotune.cli.loops import Loop, TopicLoop
+        from relay_autotune.nodes.loop_client import LoopClient
+        from relay_autotune.nodes.tune_client import TuneClient
 
-            robot = joined(LoopClient, own_namespace(options), "", options.node, ros)
-        if new:
-            # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-            if interrupted:
-                raise KeyboardInterrupt
-            joint = JointTune(robot, options) if robot else None
-        namespace = own_namespace(options) if new else options.namespace
-        spaces = namespace.split(",") if options.web else [namespace]
-        clients = [joined(TuneClient, space, options.node, ros, robot) for space in spaces]
-        client = clients[0]
-        if new:
-            nodes = stack.enter_context(joint.nodes() if joint else nodes_for(client, options))
-            client.why_lost = nodes.why_lost
-            if joint:
-                client.left_behind = joint.left_behind
-            patience = max(patience, START_WITHIN)
-        deadline = time.monotonic() + patience
+        options, ros = self._options, self._ros
 
-        for each in clients:
-            with Working(f"{'starting' if new else 'looking for'} {each.name}"):
-                each.find(
-                    patience,
+        def client(space: str, robot: LoopClient | None = None) -> TuneClient:
+            return self._joined(TuneClient, space, options.node, ros, robot)
+
+        if kind is Kind.TOPICS:
+            return [TopicLoop(client(own_namespace(options)), options)]
+        if kind is Kind.JOINT:
+            from relay_autotune.cli.joint_tune import JointLoop
+
+            robot = self._joined(LoopClient, own_namespace(options), "", options.node, ros)
+            joint = JointLoop(robot, options)
+            joint.client = client(own_namespace(options), robot)
+            joint.client.left_behind = joint.left_behind
+            return [joint]
+        spaces = options.namespace.split(",") if options.web else [options.namespace]
+        return [Loop(client(space), options) for space in spaces]
+
+    def _started(self, loops: Sequence[Loop]) -> float:
+        """Start the nodes of the command, and return how long to wait for all [s]."""
+        patience: float = self._options.wait
+        for loop in loops:
+            if loop.has_own_nodes:
+                self._nodes.enter_context(loop.nodes)
+                for name, arguments in loop.arguments().items():
+                    loop.nodes.start(name, arguments)
+                loop.client.why_lost = loop.nodes.why_lost
+                patience = max(patience, START_WITHIN)
+        return patience
+
+    def _find(self, loops: Sequence[Loop], deadline: float) -> None:
+        options = self._options
+        for loop in loops:
+            what = "starting the nodes for" if loop.has_own_nodes else "looking for"
+            with Working(f"{what} {loop.title}"):
+                loop.client.find(
+                    max(deadline - time.monotonic(), 0.0),
                     needs_identifier=not (options.dry_run or options.record_only),
-                    leave=lambda: bool(interrupted),
+                    leave=lambda: bool(self._signals.came),
                 )
-        if joint:
-            joint.show()
-        asks_here = not (options.dry_run or options.web)
-        if new and asks_here and not _is_agreed(client, options, deadline):
-            return NOTHING_FOUND
-        heed(signal.SIGINT)
-        # Until here nothing has started. Ctrl-Z may stop this command; the tune then continues.
-        heeded = ending_signals() - {signal.SIGTSTP}
-        for number in heeded:
-            heed(number)
-        if interrupted:
-            raise KeyboardInterrupt
-        if options.web:
-            from relay_autotune.cli.tune_page import TunePage
 
-            return TunePage(clients, options).run(interrupted)
+    def _is_agreed(self, loop: Loop, deadline: float) -> bool:
+        """Show the plan of a tune, and return whether it is to start."""
+        options, client = self._options, loop.client
+        with Working("looking at the loop"):
+            while True:
+                checks = list(client.check(options.amplitude).checks)
+                # Right after its start the node does not know all of these yet.
+                awaited = (NOT_KNOWN_YET,) if options.record_only else (NOT_KNOWN_YET, NO_MODEL)
+                lacking = any(text in line for line in checks for text in awaited)
+                if not (client.not_ready_yet or lacking) or time.monotonic() > deadline:
+                    break
+                time.sleep(TICK)
+        print("\n".join(check_lines(loop.checklist(checks), width())), flush=True, file=sys.stderr)
+        if not client.succeeded:
+            say(PROGRAM, f"{loop.title} refuses: {client.result.reason}")
+            return False
+        return agrees("Start the tune?", yes=options.yes)
+
+    def _tune(self, loop: Loop, deadline: float) -> None:
+        """Ask for the tune, and show it until its result is there."""
+        from relay_autotune.nodes.lifetime import never_wait_for
+
+        options, client, signals = self._options, loop.client, self._signals
         shown = Shown(sys.stderr, live=sys.stderr.isatty() and not options.dry_run)
         if not options.dry_run:
-            shown.say(f"tune of {client.name}; Ctrl-C cancels it")
+            shown.say(f"tune of {loop.title}; Ctrl-C cancels it")
         # Signals must work even while writing to standard error would block.
         wait_again = never_wait_for(sys.stderr.fileno())
-        opens = joint is not None and not options.dry_run
         try:
-            with joint.opened() if joint and opens else nullcontext(lambda _: "") as left:
-
-                def why_over(state: int) -> str:
-                    # A relay_node that is lost cannot be asked to end the tune.
-                    return left(state) or (nodes.why_lost("identifier_node") if nodes else "")
-
+            with nullcontext(lambda _: "") if options.dry_run else loop.opened() as why_over:
                 while True:
                     client.ask(options.amplitude, options.dry_run)
-                    follow(client, shown, interrupted, why_over=why_over)
-                    if interrupted or not client.not_ready_yet or time.monotonic() > deadline:
+                    follow(client, shown, signals.came, why_over=why_over)
+                    if signals.came or not client.not_ready_yet or time.monotonic() > deadline:
                         break
                     time.sleep(TICK)
                 shown.clear()
         finally:
             wait_again()
+
+    def _concluded(self, loop: Loop) -> int:
+        """Show the result, and hand over the gains."""
         # Imported here, because it loads slowly and must not delay a tune.
         from relay_autotune.cli.after_tune import AfterTune
 
+        came = self._signals.came
         # The tune is over, so a signal may end the command at once.
-        for number in heeded:
-            signal.signal(number, signal.SIG_DFL)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        if interrupted and nodes is not None and not client.cancelled:
+        self._signals.obey()
+        if loop.has_own_nodes and not loop.client.cancelled:
             # It came as the tune ended: nothing is asked for, or done, after that.
-            raise KeyboardInterrupt
+            self._signals.raise_if_came()
         try:
-            return AfterTune(client, options, _parser(), nodes, joint).conclude()
+            return AfterTune(loop, self._parser).conclude()
         except OSError:
             # The terminal is closed.
-            if signal.SIGHUP in interrupted:
+            if signal.SIGHUP in came:
                 return NOTHING_FOUND
             raise
-
-
-def _is_agreed(client: TuneClient, options: argparse.Namespace, deadline: float) -> bool:
-    """Show the plan of a tune, and return whether it is to start."""
-    with Working("looking at the loop"):
-        while True:
-            checks = list(client.check(options.amplitude).checks)
-            # Right after its start the node does not know all of these yet.
-            awaited = (NOT_KNOWN_YET,) if options.record_only else (NOT_KNOWN_YET, NO_MODEL)
-            lacking = any(text in line for line in checks for text in awaited)
-            if not (client.not_ready_yet or lacking):
-                break
-            if time.monotonic() > deadline:
-                break
-            time.sleep(TICK)
-    shown = check_lines(list(map(with_flags, checks)), width())
-    print("\n".join(shown), flush=True, file=sys.stderr)
-    if not client.succeeded:
-        say(PROGRAM, f"{client.name} refuses: {client.result.reason}")
-        return False
-    return agrees("Start the tune?", yes=options.yes)
 
 
 if __name__ == "__main__":

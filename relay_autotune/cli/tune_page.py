@@ -21,16 +21,17 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
 
-from relay_autotune.cli.apply_gains import verdict_lines
+from relay_autotune.cli.apply_gains import found_lines, verdict_lines
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, exit_status, say, worst
-from relay_autotune.cli.own_nodes import PROGRAM
+from relay_autotune.cli.loops import Loop
+from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN
+from relay_autotune.cli.proof import CONTROLLER, Proof
 from relay_autotune.cli.report import analysed_as_there, defaults, flags_of
-from relay_autotune.cli.terminal import WIDEST
 from relay_autotune.cli.tune_view import (
     STATES,
     Paint,
     Shown,
-    check_lines,
+    check_parts,
     estimate,
     follow,
     oscillation,
@@ -50,11 +51,12 @@ from relay_autotune.nodes.gains_client import GainsClient
 from relay_autotune.nodes.identifier_parameters import options_from
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import process_text
+from relay_autotune.record.record import Record
 from relay_autotune.report.case import EstimatedQuantity, case_of, model_case
 from relay_autotune.text import digits
 from relay_autotune.verdict import Verdict
 from relay_autotune.web.address import address_of
-from relay_autotune.web.live import APPLY, CHECK, REVERT, START, Live, PageCommand
+from relay_autotune.web.live import APPLY, CHECK, PROVE, REVERT, START, Live, PageCommand
 from relay_autotune.web.server import Page, in_background
 from relay_autotune.web.shape import DesignRequest, PageModel
 from relay_autotune.web.wire import curve, of_running
@@ -71,17 +73,14 @@ _TONES = {"completed": "good", "aborted": "bad", "failed": "bad"}
 class TunePage:
     """The page of one or more loops.
 
-    :param clients: of the loops' relay_nodes.
+    :param loops: that it shows.
     :param options: as the command line gives them.
     """
 
-    def __init__(self, clients: Sequence[TuneClient], options: argparse.Namespace) -> None:
-        lives = [Live(client.name) for client in clients]
+    def __init__(self, loops: Sequence[Loop], options: argparse.Namespace) -> None:
+        lives = [Live(loop.title) for loop in loops]
         self._page = Page((), address_of(options.web_address), lives)
-        self._loops = [
-            _LoopOnPage(client, options, self._page, number)
-            for number, client in enumerate(clients)
-        ]
+        self._loops = [_LoopOnPage(loop, self._page, n) for n, loop in enumerate(loops)]
 
     def run(self, interrupted: list[int]) -> int:
         """Serve the page, and do what is wished there, until a signal comes.
@@ -110,17 +109,13 @@ class TunePage:
 class _LoopOnPage:
     """One loop of a page; its tunes are shown there, and in the terminal as without a page.
 
-    :param client: of the loop's relay_node.
-    :param options: as the command line gives them.
+    :param loop: the loop.
     :param page: that shows it.
     :param number: of the loop on the page.
     """
 
-    def __init__(
-        self, client: TuneClient, options: argparse.Namespace, page: Page, number: int
-    ) -> None:
-        self._client = client
-        self._options = options
+    def __init__(self, loop: Loop, page: Page, number: int) -> None:
+        self._loop, self._client, self._options = loop, loop.client, loop.options
         self._page, self._number = page, number
         self._live = page.lives[number]
         # Lines of several loops must not be written over each other.
@@ -128,7 +123,7 @@ class _LoopOnPage:
         # The context in which commands are shown as they come.
         self._commands_shown: Callable[[], AbstractContextManager[None]] = nullcontext
         self._interrupted: list[int] = []
-        self._gains = GainsPage(client, self._live, page, number, self._is_to_end)
+        self._gains = GainsPage(loop, self._live, page, number, self._is_to_end)
         # About the running tune: messages of the cycles, K_u after each, signals and wishes to end
         # it, how many of the signals are among these, and what is done at its first feedback.
         self._cycles: list[Any] = []
@@ -148,16 +143,15 @@ class _LoopOnPage:
         self._interrupted = interrupted
         try:
             self._show_signals()
+            self._show_form()
             while not interrupted:
                 self._client.rest(_TICK)
                 wish = self._live.next_wish()
                 if wish is None:
-                    self._gains.look_now_and_then()
-                elif wish.what == CHECK:
-                    self._check()
-                elif wish.what == START:
-                    status = self._tune(interrupted)
-                    self._gains.look_after_tune()
+                    self._look_now_and_then()
+                elif wish.what in (CHECK, START):
+                    if self._is_set(wish):
+                        status = self._tune() if wish.what == START else self._check(status)
                 else:
                     with self._commands_shown():
                         self._gains.do(wish)
@@ -183,11 +177,42 @@ class _LoopOnPage:
 
     def _take_cycle(self, cycle: Any) -> None:
         settings = cycle.settings
-        self._live.tell(setpoint=settings.setpoint, hysteresis=settings.hysteresis)
+        middle, half = settings.baseline + settings.bias, settings.amplitude
+        self._live.tell(
+            setpoint=settings.setpoint,
+            hysteresis=settings.hysteresis,
+            levels=(middle - half, middle + half),
+        )
         self._cycles.append(cycle)
 
-    def _check(self) -> None:
-        """Ask whether a tune could start, and how."""
+    def _look_now_and_then(self) -> None:
+        """Read the gains in force, and show what the next tune would take, at an interval."""
+        if self._gains.look_now_and_then():
+            self._show_form()
+
+    def _show_form(self) -> None:
+        """Show the settings of the next tune."""
+        loop, told = self._loop, self._live.told
+        form = tuple(loop.answers.form(loop.form))
+        if form != told.form:
+            self._live.tell(form=form)
+
+    def _is_set(self, wish: PageCommand) -> bool:
+        """Take the settings with which a tune is to run; return whether they can be."""
+        live = self._live
+        try:
+            if wish.settings:
+                self._loop.set(dict(wish.settings))
+        except RelayAutotuneError as error:
+            checked = live.told.checked + 1
+            live.rest(str(error), good=False, checks=(), checked=checked, accepted=False)
+            return False
+        finally:
+            self._show_form()
+        return True
+
+    def _check(self, status: int) -> int:
+        """Ask whether a tune could start, and how; return the exit status of the last tune."""
         self._live.tell(phase="checking", status="looking at the loop", tone="")
         result = self._client.check(self._options.amplitude)
         accepted = self._client.succeeded
@@ -195,21 +220,24 @@ class _LoopOnPage:
         self._live.rest(
             "a tune can start" if accepted else f"refused: {result.reason}",
             good=accepted,
-            checks=tuple(check_lines(list(result.checks), WIDEST)),
+            checks=tuple(map(check_parts, self._loop.checklist(result.checks))),
             checked=self._live.told.checked + 1,
             accepted=accepted,
+            limits=self._loop.limits(),
         )
+        return status
 
-    def _tune(self, interrupted: list[int]) -> int:
+    def _tune(self) -> int:
         """Tune until the result is there."""
         client, live = self._client, self._live
         live.forget_wishes()
         self._cycles.clear()
-        self._ultimate, self._ends, self._heeded = {}, [], len(interrupted)
+        self._ultimate, self._ends, self._heeded = {}, [], len(self._interrupted)
         live.show("model", None)
         live.tell(
             phase="tuning", state="", status="asking for the tune", tone="", progress=0.0,
-            elapsed=0.0, cycles=(), process="", result=(),
+            elapsed=0.0, cycles=(), process="", result=(), setpoint=math.nan, levels=(),
+            window=(live.now, 0.0), limits=self._loop.limits(),
         )  # fmt: skip
         with ExitStack() as stack:
             client.ask(self._options.amplitude, dry_run=False)
@@ -217,6 +245,7 @@ class _LoopOnPage:
             self._at_first = lambda: stack.enter_context(self._commands_shown())
             follow(client, self, self._ends, _TICK)
             self._terminal.clear()
+        live.tell(window=(live.told.window[0], live.now))
         result = client.result
         for refused in sorted(client.refused):
             say(PROGRAM, refused)
@@ -236,6 +265,7 @@ class _LoopOnPage:
             live.tell(process=self._show(result.transfer_function, cycles))
             self._add_subject(result)
         done = client.succeeded and bool(result.gains.experiment_id)
+        self._gains.look_after_tune()
         live.forget_wishes()
         live.rest("the tune is complete" if done else f"no gains: {result.reason}", good=done)
         return exit_status(found=done, doubtful=result.verdict == Verdict.DOUBTFUL)
@@ -336,9 +366,10 @@ class _LoopOnPage:
             wanted = {name: math.nan if v is None else v for name, v in changed.items()}
             return f"replay {shlex.quote(bag)} {flags_of({**values, **wanted})}".rstrip()
 
-        case = case_of(found, bag or self._client.name)
+        case = case_of(found, bag or self._loop.title)
         case = replace(case, command=command(first))
-        subject = PageModel(case, found.shaping, first, command, self._number)
+        target = self._loop.target
+        subject = PageModel(case, found.shaping, first, command, self._number, target)
         self._page.add(subject)
 
 
@@ -371,14 +402,14 @@ _COLUMNS = 60
 class GainsPage:
     """Gains of the page in the loop's controller_node.
 
-    :param client: of the loop's relay_node, whose node this uses.
+    :param loop: the loop.
     :param live: what pages see.
     :param page: with the models whose gains are shaped.
     :param number: of the loop on the page.
     :param leave: returns True when a verification is to end.
     """
 
-    client: TuneClient
+    loop: Loop
     live: Live
     page: Page
     number: int
@@ -387,6 +418,8 @@ class GainsPage:
     _looked: float = -math.inf
     # The usual step [y]; None: to be read anew.
     _step: float | None = None
+    # The `Tune.Result` of the last tune with gains, and its samples.
+    _tuned: tuple[Any, Record] | None = None
 
     def close(self) -> None:
         """Leave the controller."""
@@ -394,18 +427,21 @@ class GainsPage:
             self._controller.close()
             self._controller = None
 
-    def look_now_and_then(self) -> None:
-        """Read the gains in force, at an interval."""
-        if time.monotonic() - self._looked > _LOOK_EVERY:
+    def look_now_and_then(self) -> bool:
+        """Read the gains in force, at an interval; return whether it is over."""
+        is_due = time.monotonic() - self._looked > _LOOK_EVERY
+        if is_due:
             self.look()
+        return is_due
 
     def look(self) -> None:
         """Read the gains in force, and show them beside the new ones."""
-        found = self.client.controllers()
+        # A controller_node of the command lives for its proof alone.
+        found = [] if self.loop.proves else self.loop.client.controllers()
         if self._controller is None or self._controller.name not in found:
             self.close()
             if found:
-                self._controller = GainsClient("", found[0], beside=self.client)
+                self._controller = GainsClient("", found[0], beside=self.loop.client)
         controller, told = self._controller, self.live.told
         if controller is None:
             if told.controller:
@@ -433,6 +469,16 @@ class GainsPage:
         """Read the gains in force, and the usual step, which comes of the tune."""
         self._step = None
         self.look()
+        result = self.loop.client.result
+        if self.loop.proves and result.gains.experiment_id:
+            try:
+                self._tuned = result, self.loop.client.record(_PATIENCE)
+                step = Proof(self.loop, result.gains, *self._tuned).step
+            except RelayAutotuneError as error:
+                say(PROGRAM, f"the gains cannot be proven: {error}")
+                self.live.tell(proves=False)
+            else:
+                self.live.tell(proves=True, step=step, proof=())
 
     def do(self, wish: PageCommand) -> None:
         """Do what was wished with the gains in force.
@@ -442,10 +488,13 @@ class GainsPage:
         live, controller = self.live, self._controller
         live.forget_wishes()
         try:
-            if controller is None:
+            if wish.what == PROVE:
+                self._prove(wish)
+            elif controller is None:
                 raise LoopError("no controller_node is in this namespace")
-            controller.find(_FOUND_WITHIN)
-            self._do(wish, controller)
+            else:
+                controller.find(_FOUND_WITHIN)
+                self._do(wish, controller)
         except RelayAutotuneError as error:
             live.rest(str(error), good=False)
         live.forget_wishes()
@@ -473,6 +522,28 @@ class GainsPage:
                 controller.allowed_steps(present).require(wish.step)
             self._verify(wish, controller, None)
 
+    def _prove(self, wish: PageCommand) -> None:
+        """Prove gains by a controller_node of the command, which ends after it."""
+        live, message = self.live, self._message(wish)
+        live.tell(phase="verifying", tone="warn", status="choosing the step", proof=())
+        live.show("proof", [])
+        if self._tuned is None:
+            raise TuningError("there are no gains of a tune that could be proven here")
+        proof = Proof(self.loop, message, *self._tuned)
+        proof.allowed.require(wish.step)
+        with proof.controller(wish.step, wish.doubtful) as controller:
+            live.tell(status=f"starting {CONTROLLER}")
+            controller.find(START_WITHIN, self.leave)
+            told = partial(live.tell, phase="verifying")
+            result = proof.made(controller, wish.step, lambda text: told(status=text), self.leave)
+            live.show("proof", [_document(step) for step in controller.steps_of(result)])
+        left = f"the command stands at {self.loop.options.at:.6g} u"
+        live.rest(
+            f"proof {'passed' if result.passed else 'failed'}: {result.reason}; {left}",
+            good=result.passed,
+            proof=tuple(found_lines(result, _COLUMNS, proof.noise_std)),
+        )
+
     def _message(self, wish: PageCommand) -> Any:
         """Return the gains that the page shows as a message."""
         if wish.asked is None or not 0 <= wish.of < len(self.page.subjects):
@@ -481,7 +552,7 @@ class GainsPage:
         if subject.loop != self.number:
             raise TuningError(f"the gains are for another loop than {self.live.told.node}")
         work = self.page.worker.ask(partial(subject.shaped, wish.asked))
-        shaped = _awaited(self.client, work, self.leave)
+        shaped = _awaited(self.loop.client, work, self.leave)
         gains, judgement = shaped.gains, shaped.judgement
         if judgement.verdict is not Verdict.TRUSTED and not wish.doubtful:
             raise TuningError(f"the gains are doubtful, and were not accepted: {judgement.reason}")

@@ -43,8 +43,8 @@ NARROWEST = 80
 
 _BAR = 16
 _GREEN, _YELLOW, _RED, _BOLD, _DIM, _PLAIN = "32", "33", "31", "1", "2", "0"
-# Where the text of a check begins: after its mark and its name.
-_CHECK_INDENT = 20
+# Where the name of a check begins, and its text.
+_NAME, _CHECK_INDENT = 6, 20
 # Lines of a terminal for what the tune waits for and sees.
 _STATUS_LINES = 2
 
@@ -168,6 +168,16 @@ def check_lines(checks: Sequence[str], width: int) -> list[str]:
             break_on_hyphens=False,
         )
     ]
+
+
+def check_parts(check: str) -> tuple[str, ...]:
+    """Return a line of the checklist in its columns: mark, name and what was found.
+
+    :param check: the line.
+    """
+    return tuple(
+        map(str.strip, (check[:_NAME], check[_NAME:_CHECK_INDENT], check[_CHECK_INDENT:]))
+    )
 
 
 def result_lines(

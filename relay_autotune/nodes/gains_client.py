@@ -78,18 +78,21 @@ class GainsClient(LoopClient):
         self._verify.destroy()
         super().close()
 
-    def find(self, patience: float) -> None:
+    def find(self, patience: float, leave: Callable[[], bool] = lambda: False) -> None:
         """Wait for the controller_node.
 
         :param patience: longest wait [s].
+        :param leave: returns True to stop waiting.
         :raises LoopError: if it is not there.
         """
-        if not self.wait(self._verify.server_is_ready, patience):
+        if not self.wait(lambda: leave() or self._verify.server_is_ready(), patience):
             there = ", ".join(n for n in self.owners("/verify") if n != self.name) or "none"
             raise LoopError(
                 f"no controller_node {self.name} within {patience:g} s; nodes that verify gains: "
                 f"{there}. Start it{self._start()}, or name another with --namespace and --node"
             )
+        if leave():
+            raise LoopError(f"ended while {self.name} was looked for")
 
     def _start(self) -> str:
         """Return what starts a controller_node for the relay_node of this namespace, if it can."""

@@ -27,7 +27,7 @@ from rclpy.validate_topic_name import validate_topic_name
 from relay_autotune.errors import FieldError, LoopError, ParameterError
 from relay_autotune.exchange.messages import made_visible
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.live_types import CommandMessage
+from relay_autotune.nodes.live_types import CommandMessage, reader_of
 
 # How long present commands are listened to [s].
 _LISTEN = 1.0
@@ -371,6 +371,25 @@ class LoopClient:
             with suppress(FieldError):
                 heard.append(commands.value(message))
         return sum(heard) / len(heard) if heard else math.nan
+
+    def measured(self, topic: str, type_name: str, field: str) -> float:
+        """Return the present measurement; NaN: none comes within a second.
+
+        :param topic: name of its topic.
+        :param type_name: its message type.
+        :param field: path of the number in its messages.
+        :raises ParameterError: if the messages of this type do not have such a number.
+        """
+        reader = reader_of(type_name, field)
+        heard: list[float] = []
+
+        def hear(message: Any) -> None:
+            with suppress(FieldError):
+                heard.append(reader.value(message))
+
+        with self._hearing(reader.kind, self._resolved(topic), hear):
+            self.wait(lambda: bool(heard), _LISTEN)
+        return heard[-1] if heard else math.nan
 
     def _topic_of(self, relay: str, topic: str, type_name: str, *, published: bool) -> str:
         """Return the name that a topic of a relay_node has, which may be remapped.

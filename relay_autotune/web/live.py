@@ -14,6 +14,7 @@ import queue
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -29,8 +30,8 @@ from relay_autotune.web.wire import curve
 # Samples of each signal that are kept for a page that is opened late.
 _KEPT = 50_000
 CHECK, START, ABORT = "check", "start", "abort"
-APPLY, VERIFY, REVERT = "apply", "verify", "revert"
-WISHES = (CHECK, START, ABORT, APPLY, VERIFY, REVERT)
+APPLY, VERIFY, REVERT, PROVE = "apply", "verify", "revert", "prove"
+WISHES = (CHECK, START, ABORT, APPLY, VERIFY, REVERT, PROVE)
 
 
 @dataclass(frozen=True)
@@ -47,16 +48,23 @@ class PageCommand:
     step: float = quantity(0.0, "y").means("Of the set-point, to verify the gains; 0: none.")
     doubtful: bool = False
     """Whether gains whose verdict is not trusted are accepted."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Of the loop by name, with which a tune is to run: a number, or the two ends of a range."""
 
     def __post_init__(self) -> None:
         check(self, TuningError)
+        for name, value in self.settings.items():
+            for number in value if isinstance(value, list) else [value]:
+                if not (isinstance(number, int | float) and math.isfinite(number)):
+                    raise TuningError(f"{name} is {value!r}, expected finite numbers")
 
 
 @dataclass(frozen=True)
 class Told:
     """What is known of the tune besides its samples.
 
-    :param node: full name of the relay_node.
+    :param node: name of the loop.
+    :param form: the settings of the next tune: name, question, unit, value and what is seen now.
     :param phase: "idle", "checking", "tuning", "analysing", "applying", "verifying" or "lost".
     :param state: what the experiment does, a word.
     :param status: what it waits for and what it sees, a sentence.
@@ -68,12 +76,16 @@ class Told:
     :param process: the newest model, as text.
     :param setpoint: about which the relay switches [y]; NaN: not known yet.
     :param hysteresis: half the width of its band [y].
-    :param checks: lines of the last check.
+    :param limits: lowest and highest measurement that a tune may see [y]; empty: not known.
+    :param levels: the two commands of the relay [u]; empty: not known yet.
+    :param window: when the last tune began, and its end [s of the samples]; 0: it runs.
+    :param checks: of the last check: mark, name and what was found.
     :param checked: number of checks so far.
     :param accepted: whether a tune could start, as far as the last check knows.
     :param result: lines of the last result.
     :param controller: full name of the controller_node; empty: there is none.
     :param present: its gains, in words.
+    :param proves: whether a controller_node of the command can prove gains.
     :param step: of its set-point that verifies gains as usual [y]; NaN: not known.
     :param proof: lines of the last verification.
     """
@@ -90,12 +102,17 @@ class Told:
     process: str = ""
     setpoint: float = math.nan
     hysteresis: float = math.nan
-    checks: tuple[str, ...] = ()
+    form: tuple[Mapping[str, Any], ...] = ()
+    limits: tuple[float, ...] = ()
+    levels: tuple[float, ...] = ()
+    window: tuple[float, ...] = ()
+    checks: tuple[tuple[str, ...], ...] = ()
     checked: int = 0
     accepted: bool = False
     result: tuple[str, ...] = ()
     controller: str = ""
     present: str = ""
+    proves: bool = False
     step: float = math.nan
     proof: tuple[str, ...] = ()
 
@@ -111,7 +128,7 @@ class _Signal:
 class Live:
     """What pages see of the tunes of one loop, and what they wish.
 
-    :param node: full name of the relay_node.
+    :param node: name of the loop.
     """
 
     def __init__(self, node: str) -> None:
@@ -160,6 +177,11 @@ class Live:
             self._shown[name] = document
             self._shown_anew.add(name)
 
+    @property
+    def now(self) -> float:
+        """The time of a sample that comes now [s]."""
+        return round(time.monotonic() - self._begun, 4)
+
     def sample(self, signal: str, value: float) -> None:
         """Take a sample of now.
 
@@ -168,7 +190,7 @@ class Live:
         """
         if not math.isfinite(value):
             return
-        at = (round(time.monotonic() - self._begun, 4), value)
+        at = (self.now, value)
         with self._lock:
             self._signals[signal].kept.append(at)
             self._signals[signal].new.append(at)

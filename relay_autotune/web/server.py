@@ -29,7 +29,7 @@ from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from relay_autotune.errors import RelayAutotuneError, SelectionError, TuningError, defect
-from relay_autotune.exchange.export import Target, exported, exports_of
+from relay_autotune.exchange.export import exported, exports_of
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.report.page import page as report_page
@@ -72,7 +72,6 @@ class Page:
     :param subjects: the models, at least one.
     :param address: where it is served.
     :param lives: the loops that are watched; empty: it shows models alone.
-    :param target: where gains for pid_controller go that are written to a file.
     """
 
     def __init__(
@@ -80,10 +79,8 @@ class Page:
         subjects: Sequence[PageModel],
         address: Address,
         lives: Sequence[Live] = (),
-        target: Target | None = None,
     ) -> None:
         self.subjects: list[PageModel] = []
-        self.target = target or Target()
         self.address = address
         self.lives = tuple(lives)
         self.computes_ahead = True
@@ -336,7 +333,7 @@ class _Export(_Guarded):
             doubt = judgement.reason if judgement.verdict is Verdict.DOUBTFUL else ""
             if doubt and self.get_query_argument("accept_doubtful", "") != "yes":
                 raise TuningError("these gains are doubtful, and were not accepted")
-            text = exported(shaped.gains, name, self.page.target, doubt=doubt)
+            text = exported(shaped.gains, name, subject.target, doubt=doubt)
         except RelayAutotuneError as error:
             raise HTTPError(HTTPStatus.CONFLICT, reason=_one_line(error)) from error
         self.set_header("Content-Type", "text/plain; charset=utf-8")
@@ -441,6 +438,7 @@ class _Socket(_Guarded, WebSocketHandler):
             None if asked is None else asked_of(asked, tuple(RULES)),
             question.get("step", 0.0),
             question.get("accept_doubtful") is True,
+            dict(question.get("settings", {})),
         )
 
     def _tell_news(self) -> None:

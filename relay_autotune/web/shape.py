@@ -17,6 +17,7 @@ import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
+from relay_autotune.exchange.export import Target
 from relay_autotune.loop.analysis import abscissae, inverted, step_responses
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.process.transfer_function import TransferFunction
@@ -171,6 +172,7 @@ class PageModel:
     :param first: what the command line asks for.
     :param command: returns the command line that gives the same again.
     :param loop: number of the loop that it is of, on a page that watches some.
+    :param target: where gains go that are written to a file.
     """
 
     case: Case
@@ -178,6 +180,7 @@ class PageModel:
     first: DesignRequest
     command: Callable[[DesignRequest], str]
     loop: int = 0
+    target: Target = field(default_factory=Target)
     _found: dict[DesignRequest, tuple[Designed, Gains] | TuningError] = field(
         default_factory=dict, repr=False
     )

@@ -23,16 +23,9 @@ from made_experiments import record_of
 
 from relay_autotune.cli import report, tune_loop
 from relay_autotune.cli.after_tune import AfterTune, prefix
-from relay_autotune.cli.own_nodes import (
-    OwnNodes,
-    add_new_loop,
-    is_new_loop,
-    is_of_joint,
-    namespace_of_joint,
-    nodes_for,
-    ros_arguments,
-    with_flags,
-)
+from relay_autotune.cli.loops import Loop, TopicLoop
+from relay_autotune.cli.own_nodes import OwnNodes, namespace_of_joint, ros_arguments
+from relay_autotune.cli.settings import Kind, kind_of, with_flags
 from relay_autotune.cli.terminal import agrees, asked_for_file, number_of, pair_of
 from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
@@ -99,29 +92,35 @@ def test_a_file_that_exists_is_noticed_before_anything_is_looked_at(tmp_path, ca
 class Looker:
     """A client of a loop whose topics have these types, with a present command."""
 
-    def __init__(self, present: float = math.nan, measured: str = "std_msgs/msg/Float32") -> None:
-        self.present, self.measured = present, measured
+    def __init__(
+        self,
+        present: float = math.nan,
+        kind: str = "std_msgs/msg/Float32",
+        measures: float = math.nan,
+    ) -> None:
+        self.present, self.kind, self.measures = present, kind, measures
 
     def kind_of(self, topic: str, patience: float, *, published: bool) -> str:
-        return self.measured if topic == "/tank/level" else "std_msgs/msg/Float64"
+        return self.kind if topic == "/tank/level" else "std_msgs/msg/Float64"
 
     def commanded(self, topic: str, type_name: str, field: str, others: str) -> float:
         return self.present
+
+    def measured(self, topic: str, type_name: str, field: str) -> float:
+        return self.measures
 
     def require_uncontrolled(self) -> None:
         pass
 
 
 def options(*words: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    add_new_loop(parser)
-    parser.set_defaults(namespace="tank", wait=1.0, amplitude=0.0, record_only=False)
-    return parser.parse_args(["--measurement", "/tank/level", "--command", "/tank/valve", *words])
+    given = ["--measurement", "/tank/level", "--command", "/tank/valve", "--namespace", "tank"]
+    return tune_loop._parser().parse_args([*given, *words])
 
 
 def arguments(client: Any, given: argparse.Namespace) -> dict[str, str]:
     """Return parameters and remappings of the relay_node that would be started."""
-    words = nodes_for(client, given)._nodes["relay_node"]
+    words = TopicLoop(client, given).arguments()["relay_node"]
     return dict(word.split(":=", 1) for word in words if ":=" in word)
 
 
@@ -154,13 +153,13 @@ def test_flags_become_limits_levels_topics_and_types_without_a_question() -> Non
         "command_type": "std_msgs/msg/Float64",
         "command_field": "data",
     }
-    assert set(nodes_for(Looker(), given)._nodes) == {"relay_node", "identifier_node"}
+    assert set(TopicLoop(Looker(), given).arguments()) == {"relay_node", "identifier_node"}
 
 
 def test_the_law_of_another_program_is_designed_for() -> None:
     given = options("--within", "30", "50", "--at", "2", "--command-within", "0", "5")
     given.law, given.sample_period = "simple_pid", 0.1
-    words = nodes_for(Looker(), given)._nodes["identifier_node"]
+    words = TopicLoop(Looker(), given).arguments()["identifier_node"]
     assert {"law:=simple_pid", "sample_period:=0.1"} < set(words)
 
 
@@ -170,7 +169,7 @@ def test_a_law_that_cannot_be_designed_for_is_refused_at_once() -> None:
             tune_loop.main(words)
     words = ["--controller", "wheel_controller", "--joint", "left_wheel", "--law", "px4_rate"]
     with pytest.raises(SelectionError, match="--law is for a loop of two topics"):
-        is_of_joint(tune_loop._parser().parse_args(words))
+        kind_of(tune_loop._parser().parse_args(words))
 
 
 def test_what_is_not_given_is_asked_for_until_it_can_be_read(typed: list[str]) -> None:
@@ -233,30 +232,54 @@ def test_what_failed_names_the_flag_and_no_node_that_ends_with_the_command() -> 
     assert with_flags(other) == other
 
 
+def test_a_question_shows_what_is_now_and_refuses_what_cannot_be(
+    typed: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    typed += ["2", "30 40", "30 50", "3 9", "0 5"]
+    found = arguments(Looker(measures=44.0), options())
+    assert not typed
+    assert (found["measurement_max"], found["command_max"]) == ("50.0", "5.0")
+    said = capsys.readouterr().err
+    assert "the measurement is 44 now: give limits around it" in said
+    assert "the present command is 2: give limits around it" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--within", "1", "9"), "--within 1 9: the measurement is 44 now: give limits around it"),
+        (("--command-within", "3", "9"), "--at 2: expected a command from 3 to 9, the limits"),
+    ],
+)
+def test_a_flag_that_cannot_be_is_refused_at_once(words: tuple[str, ...], told: str) -> None:
+    with pytest.raises(SelectionError, match=told):
+        TopicLoop(Looker(measures=44.0), options("--at", "2", *words))
+
+
 def test_where_nobody_can_be_asked_the_flag_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
     with pytest.raises(LoopError, match="give --at"):
-        nodes_for(Looker(), options())
+        TopicLoop(Looker(), options())
     with pytest.raises(LoopError, match="give --within"):
-        nodes_for(Looker(), options("--at", "2"))
+        TopicLoop(Looker(), options("--at", "2"))
     with pytest.raises(LoopError, match="give --command-within"):
-        nodes_for(Looker(), options("--at", "2", "--within", "1", "9"))
+        TopicLoop(Looker(), options("--at", "2", "--within", "1", "9"))
     with pytest.raises(LoopError, match="give --yes"):
         agrees("Start?", yes=False)
     assert agrees("Start?", yes=True)
 
 
 def test_flags_of_a_new_loop_need_both_topics() -> None:
-    assert is_new_loop(options())
+    assert kind_of(options()) is Kind.TOPICS
     given = options("--within", "1", "9")
     given.command = None
     with pytest.raises(SelectionError, match="--measurement is for a loop without nodes"):
-        is_new_loop(given)
+        kind_of(given)
     given.measurement = None
     with pytest.raises(SelectionError, match="--within is for a loop without nodes"):
-        is_new_loop(given)
+        kind_of(given)
     given.within = None
-    assert not is_new_loop(given)
+    assert kind_of(given) is Kind.NODES
 
 
 def test_commands_within_messages_become_parameters() -> None:
@@ -265,7 +288,7 @@ def test_commands_within_messages_become_parameters() -> None:
         "--command-field", "data[1]", "--command-message", "{data: [0, 0]}",
         "--command-period", "0.1",
     )  # fmt: skip
-    found = arguments(Looker(measured="sensor_msgs/msg/JointState"), given)
+    found = arguments(Looker(kind="sensor_msgs/msg/JointState"), given)
     assert found["measurement_field"] == "velocity[l]"
     assert found["command_field"] == "data[1]"
     # The value of a parameter is read as YAML once more.
@@ -281,6 +304,13 @@ def test_a_field_that_is_not_there_is_asked_for_or_named_by_its_flag(typed: list
     sys.stdin.isatty = lambda: False  # type: ignore[method-assign]
     with pytest.raises(SelectionError, match=r"Float32 has no field .*, such as --field data"):
         arguments(Looker(), options(*words))
+
+
+def topic_loop(client: Any, given: argparse.Namespace) -> TopicLoop:
+    """Return a loop that has been looked at."""
+    loop = TopicLoop.__new__(TopicLoop)
+    Loop.__init__(loop, client, given)
+    return loop
 
 
 def ended(reason: str, **values: Any) -> Any:
@@ -301,7 +331,7 @@ def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
 
     def repeated(result: Any, proven: bool | None) -> list[tuple[str, str]]:
         client: Any = SimpleNamespace(result=result, record=lambda patience: inside)
-        return AfterTune(client, given, parser).repeated(proven)
+        return AfterTune(topic_loop(client, given), parser).repeated(proven)
 
     silent = ended("no measurement on /tank/level for 1.01 s")
     (what, command), (then, told) = repeated(silent, None)
@@ -336,7 +366,7 @@ def shown(
     given = parser.parse_args(["--measurement", "/tank/level", "--command", "/tank/valve"])
     given.at, given.within, given.command_within = 35.0, [0.0, 90.0], [0.0, 100.0]
     words = ["-r", "__ns:=/tune_loop_1", "-r", "command:=/tank/valve", "-p", "baseline:=35.0"]
-    nodes: Any = SimpleNamespace(why_lost=lambda: "", arguments=lambda name: words)
+    nodes: Any = SimpleNamespace(why_lost=lambda: "")
     monkeypatch.chdir(tmp_path)
 
     def analysed(_: Any, values: dict[str, Any], __: Any) -> Any:
@@ -359,7 +389,10 @@ def shown(
         result.bag = tempfile.mkdtemp(dir=tmp_path) if bag is None else bag
         kinds["command_type"] = command_type
         monkeypatch.setattr(AfterTune, "_offered", lambda _: (passed, against))
-        proven, steps = AfterTune(client, given, parser, nodes).hand_over()
+        loop = topic_loop(client, given)
+        loop.nodes = nodes
+        loop.arguments = lambda: {"relay_node": words}  # type: ignore[method-assign]
+        proven, steps = AfterTune(loop, parser).hand_over()
         assert proven is passed
         assert not typed
         told = " ".join(capsys.readouterr().out.split())
@@ -461,10 +494,10 @@ def test_after_an_end_that_would_come_again_the_same_command_is_not_offered_agai
     client: Any = SimpleNamespace(
         result=result, record=lambda patience: SimpleNamespace(measurement=last)
     )
-    tune = AfterTune(client, given, parser)
-    assert tune.left_its_limits is outside
-    assert left_at in tune.left()
-    ((name, told),) = tune.repeated(None)
+    loop = topic_loop(client, given)
+    assert loop.left_its_limits is outside
+    assert left_at in loop.left()
+    ((name, told),) = AfterTune(loop, parser).repeated(None)
     assert name == next_step
     assert ("1040" in told) == (next_step == "run it again")
 

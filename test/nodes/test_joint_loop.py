@@ -16,7 +16,7 @@ import pytest
 import yaml
 from toolbox_pid import ToolboxPid
 
-from relay_autotune.cli.joint_tune import JointTune
+from relay_autotune.cli.joint_tune import JointLoop
 from relay_autotune.errors import LoopError
 from relay_autotune.loop import laws
 from relay_autotune.loop.gains import Controller
@@ -253,8 +253,9 @@ def test_controllers_are_off_until_the_relay_ends_and_no_longer(is_open: bool) -
         _client=SimpleNamespace(publishing=lambda *_: publishing),
         _give_references_back=lambda: given.append("references"),
         _put_back=lambda: given.append("references"),
+        nodes=SimpleNamespace(why_lost=lambda _: ""),
     )  # fmt: skip
-    with JointTune.opened(tune) as why_over:
+    with JointLoop.opened(tune) as why_over:
         assert why_over(Tune.Feedback.STATE_RELAY) == ""
         assert manager.active == ({"one"} if is_open else {"pid"})
         # The model is still to be computed.
@@ -264,7 +265,7 @@ def test_controllers_are_off_until_the_relay_ends_and_no_longer(is_open: bool) -
     assert given == ["command", "references"] * is_open
     # relay_node is lost, and the reference is where the relay had it.
     given.clear()
-    with pytest.raises(LoopError), JointTune.opened(tune):
+    with pytest.raises(LoopError), JointLoop.opened(tune):
         raise LoopError("relay_node has ended")
     assert given == (["command", "references"] if is_open else ["references"])
     assert manager.active == {"pid"}
@@ -282,14 +283,14 @@ def test_a_joint_whose_controller_is_off_is_told_with_what_to_type() -> None:
         ),
         _manager=manager,
     )
-    tune.activation = lambda: JointTune.activation(tune)
-    assert JointTune.left(tune) == "pid is active, the reference of left is that of before"
+    tune.activation = lambda: JointLoop.activation(tune)
+    assert JointLoop.left(tune) == "pid is active, the reference of left is that of before"
     assert tune.activation() == ""
     manager.switch([], ["pid"])
-    assert JointTune.left(tune) == "pid is not active: left has the last effort that it got"
+    assert JointLoop.left(tune) == "pid is not active: left has the last effort that it got"
     assert tune.activation() == "type pid"
     tune._manager = silent
-    assert JointTune.left(tune).startswith("it has not answered: left has the last effort")
+    assert JointLoop.left(tune).startswith("it has not answered: left has the last effort")
 
 
 def test_a_manager_that_is_gone_is_not_waited_for_beyond_the_time_of_the_way_back() -> None:
@@ -397,10 +398,10 @@ def test_the_trajectory_to_type_holds_numbers_also_where_a_joint_is_almost_at_ze
     arm = Arm()
     tune = SimpleNamespace(
         _loop=joint_loop(arm, arm, "arm", "arm_2"),
-        _within=(-1.0, 2.0),
+        options=SimpleNamespace(within=(-1.0, 2.0)),
         _position_of=lambda _: 5e-5,
     )
-    *words, text = shlex.split(JointTune._short_trajectory(tune, 0.3))
+    *words, text = shlex.split(JointLoop._short_trajectory(tune, 0.3))
     assert words[-1] == "trajectory_msgs/msg/JointTrajectory"
     (point,) = yaml.safe_load(text)["points"]
     assert point["positions"] == [5e-5, 0.15005]
@@ -410,16 +411,16 @@ def test_an_opened_joint_without_limits_of_the_command_is_tuned_without_them() -
     arm = Arm()
     loop = joint_loop(arm, arm, "arm", "arm_2")
     options = SimpleNamespace(
-        open=True, amplitude=0.5, record_only=True, measurement=None, field="data", wait=0.0
-    )
+        open=True, amplitude=0.5, record_only=True, measurement=None, field="data", wait=0.0,
+        within=(-1.0, 2.0), command_within=None,
+    )  # fmt: skip
     tune = SimpleNamespace(
-        _loop=loop, _options=options, _manager=arm, _held=[math.nan], _baseline=0.0,
-        _client=SimpleNamespace(kind_of=lambda *_, **__: ""), _within=(-1.0, 2.0),
-        _command_within=None, _space="tune",
+        _loop=loop, options=options, _manager=arm, _held=[math.nan], _baseline=0.0,
+        _client=SimpleNamespace(kind_of=lambda *_, **__: ""), _space="tune",
         _forward=SimpleNamespace(name="forward", needs=(loop.interface,)),
     )  # fmt: skip
-    tune._opened_ends = lambda: JointTune._opened_ends(tune)
-    words = JointTune.nodes(tune).arguments("relay_node")
+    tune._opened_ends = lambda: JointLoop._opened_ends(tune)
+    words = JointLoop.arguments(tune)["relay_node"]
     assert "measurement_min:=-1.0" in words
     assert not any(word.startswith("command_m") and "inf" in word for word in words)
 

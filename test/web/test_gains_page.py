@@ -29,7 +29,8 @@ def sent(subject, wish):
     worker = SimpleNamespace(ask=lambda work: ThreadPoolExecutor(1).submit(work))
     client = SimpleNamespace(wait=lambda is_done, patience: [None for _ in iter(is_done, True)])
     page = SimpleNamespace(subjects=[subject], worker=worker)
-    return GainsPage(client, Live("/relay_node"), page, 0, lambda: False)._message(wish)
+    loop = SimpleNamespace(client=client)
+    return GainsPage(loop, Live("/relay_node"), page, 0, lambda: False)._message(wish)
 
 
 def test_the_gains_are_those_that_the_page_shows():

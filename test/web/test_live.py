@@ -138,6 +138,9 @@ def test_figures_are_told_when_they_change_and_to_a_page_that_is_opened_late():
         {"do": "apply", "of": 0, "asked": {"rule": "os.system"}},
         {"do": "verify", "step": "1"},
         {"do": "verify", "step": math.inf},
+        {"do": "start", "settings": {"at": "2"}},
+        {"do": "start", "settings": {"within": [1, None]}},
+        {"do": "start", "settings": 7},
     ],
 )
 def test_an_impossible_wish_ends_the_connection(wish):
@@ -190,7 +193,7 @@ def test_nobody_who_looks_does_not_make_what_is_new_grow(monkeypatch):
 @pytest.mark.browser
 def test_the_page_of_a_loop_with_hostile_texts(tmp_path):
     live = Live(HOSTILE)
-    live.tell(status=HOSTILE, checks=(HOSTILE,), cycles=(HOSTILE,), result=(HOSTILE,))
+    live.tell(status=HOSTILE, checks=((HOSTILE, HOSTILE, HOSTILE),), cycles=(HOSTILE,), result=(HOSTILE,))
     with served([], live=live) as url, Chromium(tmp_path) as browser:
         tab = browser.tab(url)
         tab.wait("document.body.dataset.phase === 'idle'")

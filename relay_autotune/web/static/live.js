@@ -8,6 +8,8 @@ import { Plot } from "./plot.js";
 const $ = (id) => document.getElementById(id);
 // More points than this are not kept, some for each pixel of a figure.
 const MOST = 2000;
+// What stands for a loop at which nothing is done, by how the last thing went.
+const IDLE = { "": "ready", good: "ready", warn: "ready", bad: "not done" };
 const TONES = { settling: "warn", kick: "warn", relay: "warn", completed: "good", aborted: "bad", failed: "bad" };
 
 export function table(host, rows, cells) {
@@ -24,6 +26,31 @@ export function table(host, rows, cells) {
     body.append(line);
   }
   host.replaceChildren(...(host.tagName === "TBODY" ? body.children : [body]));
+}
+
+// Lines of a checklist that say what a tune will do.
+const PLAN = ["levels", "limits", "at rest", "expected", "time"];
+const MARKS = { ok: ["\u2713", "good"], note: ["!", "warn"], NO: ["\u2715", "bad"] };
+
+function checklist(host, checks) {
+  host.replaceChildren(...checks.map(([mark, name, found]) => {
+    const [sign, tone] = MARKS[mark] || [mark, ""];
+    const line = document.createElement("li");
+    line.className = tone;
+    for (const [kind, text] of [["mark", sign], ["name", name], ["found", found]]) {
+      const part = document.createElement("span");
+      part.className = kind;
+      part.textContent = text;
+      line.append(part);
+    }
+    return line;
+  }));
+}
+
+// How many of some checks have passed.
+function sum(checks) {
+  const passed = checks.filter(([mark]) => mark === "ok").length;
+  return `Checklist: ${passed} of ${checks.length} checks passed`;
 }
 
 function texts(host, name, lines) {
@@ -65,13 +92,38 @@ class Signal {
   get curve() { return { x: this.times.subarray(0, this.count), y: this.values.subarray(0, this.count) }; }
 }
 
+// Time that is shown while no tune has run [s].
+const LAST = 60;
+
+// The values of a signal within a time; the one before it holds at its beginning.
+function within(signal, [from, to]) {
+  const found = [];
+  for (let k = 0; k < signal.count; k += 1) {
+    if (signal.times[k] >= from && signal.times[k] <= to) found.push(signal.values[k]);
+  }
+  return found;
+}
+
+// The range of a figure: all values, the lines, and a limit where it is not far away.
+function reach(values, limits, lines) {
+  const all = [...values, ...lines];
+  if (!all.length) return undefined;
+  let low = Math.min(...all), high = Math.max(...all);
+  const span = high - low || Math.abs(high) || 1;
+  for (const limit of limits) {
+    if (limit > low - 2 * span && limit < high + 2 * span) { low = Math.min(low, limit); high = Math.max(high, limit); }
+  }
+  const room = 0.06 * (high - low) || 0.05 * Math.abs(high) || 0.5;
+  return [low - room, high + room];
+}
+
 // What is known of one loop.
 class Loop {
   constructor(number) {
     this.number = number;
     this.told = null;
     this.shown = {};
-    this.asking = 0; // number of the check after which the start is to be confirmed; 0: none
+    this.planned = 0; // number of the check that says how a tune with the form's settings goes
     this.signals = { measurement: new Signal(), command: new Signal() };
   }
 
@@ -113,11 +165,18 @@ export class Live {
       command: new Plot($("plot-live-command"), { label: "Command as it comes", x: "time [s]", y: "command [u]" }),
     };
     $("check").addEventListener("click", () => send("check"));
-    $("start").addEventListener("click", () => { this.loop.asking = this.told.checked + 1; send("check"); });
+    $("start").addEventListener("click", () => this.openPlan());
+    $("plan-check").addEventListener("click", () => this.checkPlan());
+    $("plan-start").addEventListener("click", () => this.startPlan());
+    $("plan-leave").addEventListener("click", () => $("plan").close());
+    $("form").addEventListener("change", () => this.checkPlan());
+    $("form").addEventListener("input", () => { $("plan-start").disabled = true; });
+    $("form").addEventListener("submit", (event) => event.preventDefault());
     $("abort").addEventListener("click", () => send("abort"));
     this.model = new Plot($("plot-so-far"), { label: "Measurement so far, and the model", x: "time [s]", y: "measurement [y]" });
     this.ultimate = new Plot($("plot-ku"), { label: "K_u after each cycle with its 95 % interval", x: "cycles", y: "K_u [u/y]" });
     this.proof = new Plot($("plot-proof"), { label: "Verification: measured and predicted", x: "time [s]", y: "measurement [y]" });
+    $("prove").addEventListener("click", () => this.prove(Number($("step").value)));
     $("apply").addEventListener("click", () => this.apply(Number($("step").value)));
     $("apply-only").addEventListener("click", () => this.apply(0));
     $("verify").addEventListener("click", () => this.verify(Number($("step").value)));
@@ -143,12 +202,11 @@ export class Live {
       loop.told = message.live;
       this.showLoops();
       // A question must not stand before what ends a tune.
-      if (loop.running && !(before && before.phase === loop.phase) && $("question").open) $("question-no").click();
-      if (loop === this.loop) this.show(before);
-      if (loop.asking && loop.told.checked >= loop.asking) {
-        loop.asking = 0;
-        if (loop.told.accepted) this.ask(loop);
+      if (loop.running && !(before && before.phase === loop.phase)) {
+        if ($("question").open) $("question-no").click();
+        if ($("plan").open) $("plan").close();
       }
+      if (loop === this.loop) this.show(before);
     }
     if (loop !== this.loop) return;
     const { proof, model } = message.shown || {};
@@ -216,16 +274,33 @@ export class Live {
     const { measurement, command } = this.signals;
     const known = [measurement, command].filter((each) => each.count);
     if (!known.length) return;
-    const xs = [Math.min(...known.map((each) => each.first)), Math.max(...known.map((each) => each.last))];
+    const last = Math.max(...known.map((each) => each.last));
+    const { setpoint, hysteresis, limits = [], levels = [], window: tuned = [] } = this.told || {};
+    const [from, to] = tuned;
+    // The last tune with a little before it, else the last minute.
+    const first = Math.min(...known.map((each) => each.first));
+    const end = to || last;
+    const begin = from === undefined ? last - LAST : from - 0.05 * (end - from);
+    const xs = [Math.max(first, begin), end];
     const lines = [];
-    const { setpoint, hysteresis } = this.told || {};
     if (setpoint !== null && setpoint !== undefined) {
       lines.push({ y: setpoint, kind: "setpoint" });
       if (hysteresis > 0) lines.push({ y: setpoint + hysteresis, kind: "band-edge" }, { y: setpoint - hysteresis, kind: "band-edge" });
     }
+    const held = command.count ? command.now : null;
     const said = (signal, unit) => `now ${signal.count ? signal.now.toPrecision(4) : "none"} ${unit}`;
-    this.plots.measurement.draw({ xs, curves: [{ ...measurement.curve, kind: "measured", name: "measurement" }], lines, said: said(measurement, "y") });
-    this.plots.command.draw({ xs, curves: [{ ...command.curve, kind: "command", name: "command" }], said: said(command, "u") });
+    this.plots.measurement.draw({
+      xs, ys: reach(within(measurement, xs), limits, lines.map((line) => line.y)), said: said(measurement, "y"),
+      curves: [{ ...measurement.curve, kind: "measured", name: "measurement" }],
+      lines: [...lines, ...limits.map((y) => ({ y, kind: "bound" }))],
+      names: [["bound", limits.length ? "limits of the tune" : ""], ["setpoint", lines.length ? "set-point, with the relay's band" : ""]],
+    });
+    this.plots.command.draw({
+      xs, ys: reach(within(command, xs), [], held === null ? levels : [...levels, held]), said: said(command, "u"),
+      curves: [{ ...command.curve, kind: "input", name: "command" }],
+      lines: levels.map((y) => ({ y, kind: "level" })),
+      names: [["level", levels.length ? "the relay's two levels" : ""]],
+    });
     document.body.dataset.measured = measurement.count ? measurement.last : "";
   }
 
@@ -235,13 +310,15 @@ export class Live {
     $("live-bar").hidden = false;
     $("live-title").textContent = told.node;
     const tuning = told.phase === "tuning";
-    const state = tuning ? told.state || "asked" : told.phase;
+    const state = tuning ? told.state || "asked" : told.phase === "idle" ? IDLE[told.tone] : told.phase;
     if ($("live-state").textContent !== state) $("live-state").textContent = state;
     $("live-state").className = `chip ${told.tone || TONES[told.state] || ""}`;
     $("live-status").textContent = told.status;
     $("abort").disabled = !this.loop.running;
     $("abort").textContent = told.phase === "verifying" ? "End the verification" : "Abort the tune";
     $("check").disabled = $("start").disabled = told.phase !== "idle";
+    $("abort").hidden = !this.loop.running;
+    $("progress").hidden = !tuning;
     $("progress").value = told.progress || 0;
     const left = told.remaining > 0 ? `, about ${told.remaining.toFixed(0)} s left` : "";
     $("live-times").textContent = tuning ? `${told.elapsed.toFixed(0)} s so far${left}` : "";
@@ -249,12 +326,18 @@ export class Live {
     texts($("live-cycles"), "li", told.cycles);
     $("live-process").textContent = told.process;
     $("checks-box").hidden = !told.checks.length;
+    $("checks-sum").textContent = sum(told.checks);
     if (!told.accepted && told.checks.length && !(before && before.checks.length)) $("checks-box").open = true;
-    $("live-checks").textContent = told.checks.join("\n");
+    checklist($("live-checks"), told.checks);
+    this.showPlan();
     $("result-box").hidden = !told.result.length;
     $("live-result").textContent = told.result.join("\n");
     document.body.dataset.phase = told.phase;
-    $("force").hidden = !told.controller;
+    const runs = Boolean(told.controller);
+    $("force").hidden = !(runs || told.proves);
+    $("force-title").textContent = runs ? "The running controller" : "Prove the gains";
+    for (const id of ["apply", "apply-only", "verify", "revert"]) $(id).hidden = !runs;
+    $("prove").hidden = runs;
     if (told.step !== null && (!before || before.step !== told.step)) $("step").value = told.step;
     $("force-proof").hidden = !told.proof.length;
     $("force-proof").textContent = told.proof.join("\n");
@@ -263,15 +346,15 @@ export class Live {
 
   // The gains of the page beside those of the running controller, and what may be done.
   showForce() {
-    if (!(this.loop && this.told && this.told.controller)) return;
+    if (!(this.loop && this.told && (this.told.controller || this.told.proves))) return;
     const { controller, present, phase } = this.told;
     const new_ = this.offered();
-    $("force-now").textContent = `${controller} has ${present}`;
-    $("force-new").textContent = new_ ? `Applied would be ${new_.words}${new_.doubtful ? ", which are doubtful" : ""}.` : "The page shows no gains that could be applied.";
+    $("force-now").textContent = controller ? `${controller} has ${present}` : "Nobody controls this loop: a controller of this command makes one step, and ends.";
+    $("force-new").textContent = new_ ? `${controller ? "Applied" : "Proven"} would be ${new_.words}${new_.doubtful ? ", which are doubtful" : ""}.` : "The page shows no gains that could be applied.";
     const idle = phase === "idle";
     const step = Number($("step").value);
     const moves = Number.isFinite(step) && step !== 0;
-    $("apply").disabled = !(idle && new_ && moves);
+    $("prove").disabled = $("apply").disabled = !(idle && new_ && moves);
     $("apply-only").disabled = !(idle && new_);
     $("verify").disabled = !(idle && moves);
     $("revert").disabled = !idle;
@@ -288,7 +371,9 @@ export class Live {
     const { cycle, value, low, high } = model.gains;
     const sure = low.map((each, k) => k).filter((k) => low[k] !== null);
     const of = (values) => sure.map((k) => values[k]);
+    $("plot-ku").hidden = !cycle.length;
     this.ultimate.draw({
+      marks: cycle.map((x, k) => ({ x, y: value[k], kind: "point", name: "" })),
       bands: [{ x: of(cycle), low: of(low), high: of(high), name: "95 % interval" }],
       curves: [curve([cycle, value], "model", "K_u")],
       said: `now ${value[value.length - 1]}`,
@@ -333,9 +418,74 @@ export class Live {
     if (await this.agreed(what, "Return to them")) this.send("revert", {}, loop);
   }
 
-  async ask(loop) {
-    const levels = loop.told.checks.find((line) => line.includes("levels")) || "";
-    const what = `The relay will move the command of ${loop.told.node} until the tune has ended. ${levels.replace(/\s+/g, " ")}`;
-    if (await this.agreed(what, "Start the tune")) this.send("start", {}, loop);
+  async prove(step) {
+    const new_ = this.offered();
+    if (!new_) return;
+    const { loop } = this;
+    if (new_.doubtful && !(await this.agreed(`These gains are doubtful: ${new_.doubtful}`, "Take them all the same"))) return;
+    const what = `A controller of this command takes over ${this.told.node} with ${new_.words}, moves the set-point by ${step} y and back, and ends at the present command.`;
+    if (await this.agreed(what, "Prove the gains")) this.send("prove", { ...new_.wish, step, accept_doubtful: Boolean(new_.doubtful) }, loop);
+  }
+
+  // The settings of the form; null: one of them is missing.
+  settings() {
+    const found = {};
+    for (const { name } of this.told.form) {
+      const texts = [...document.querySelectorAll(`#form input[name=${name}]`)].map((input) => input.value.trim());
+      if (texts.some((text) => text === "" || !Number.isFinite(Number(text)))) return null;
+      const numbers = texts.map(Number);
+      found[name] = numbers.length > 1 ? numbers : numbers[0];
+    }
+    return found;
+  }
+
+  openPlan() {
+    const { node, form } = this.told;
+    $("plan-title").textContent = `Tune ${node}`;
+    $("form").replaceChildren();
+    for (const { name, question, unit, values, ends, now } of form) {
+      const row = document.createElement("div");
+      const label = document.createElement("label");
+      label.textContent = `${question} [${unit}]`;
+      row.append(label);
+      const fields = document.createElement("span");
+      for (let k = 0; k < ends; k += 1) {
+        const input = document.createElement("input");
+        Object.assign(input, { name, type: "number", step: "any", value: values && values[k] !== null ? values[k] : "" });
+        input.id = `form-${name}-${k}`;
+        if (k === 0) label.htmlFor = input.id;
+        else input.setAttribute("aria-label", `${question}, upper end`);
+        fields.append(input);
+      }
+      if (now) fields.append(now);
+      row.append(fields);
+      $("form").append(row);
+    }
+    $("plan").showModal();
+    this.checkPlan();
+  }
+
+  checkPlan() {
+    const settings = this.settings();
+    this.loop.planned = 0;
+    $("plan-start").disabled = true;
+    if (!settings) { $("plan-said").textContent = "Fill in all of them: nothing moves before you start the tune."; $("plan-lines").replaceChildren(); return; }
+    this.loop.planned = this.told.checked + 1;
+    $("plan-said").textContent = "looking at the loop";
+    this.send("check", { settings });
+  }
+
+  // What a tune with the settings of the form will do, or why it cannot start.
+  showPlan() {
+    const { told, loop } = this;
+    if (!$("plan").open || !loop.planned || told.checked < loop.planned) return;
+    $("plan-start").disabled = !told.accepted || told.phase !== "idle";
+    $("plan-said").textContent = told.accepted ? "Nothing moves before you start the tune; it can be aborted at any time." : told.status;
+    checklist($("plan-lines"), told.checks.filter(([mark, name]) => mark !== "ok" || PLAN.includes(name)));
+  }
+
+  startPlan() {
+    this.send("start", { settings: this.settings() });
+    $("plan").close();
   }
 }

@@ -119,20 +119,23 @@ function showVerdict(verdict, checks) {
   const said = JSON.stringify(checks);
   if (said === saidChecks) return;
   saidChecks = said;
-  $("marks").replaceChildren();
   $("checks").replaceChildren();
+  $("failures").replaceChildren();
+  const failed = checks.filter(([, tone]) => tone !== "good");
+  const passed = `${checks.length - failed.length} of ${checks.length} checks passed`;
+  const named = failed.map(([, , name]) => name.toLowerCase()).join(", ");
+  $("marks").textContent = checks.length ? passed + (named ? `; not ${named}` : "") : "";
+  $("marks").className = failed.some(([, tone]) => tone === "bad") ? "bad" : failed.length ? "warn" : "";
+  $("checks-said").textContent = checks.length ? `${passed}.` : "";
   for (const [mark, tone, name, value, meaning] of checks) {
-    const small = put($("marks"), "li", undefined, tone);
-    put(small, "span", mark, "mark").setAttribute("aria-hidden", "true");
-    put(small, "span", name, "check-name");
-    small.title = meaning;
-    small.setAttribute("aria-label", `${name}: ${{ good: "passed", warn: "doubtful", bad: "failed" }[tone]}`);
-    const item = put($("checks"), "li", undefined, tone);
-    put(item, "span", mark, "mark").setAttribute("aria-hidden", "true");
-    const what = put(item, "span", undefined, "what");
-    put(what, "b", name);
-    what.append(` ${value}`);
-    put(item, "span", meaning, "why");
+    for (const host of tone === "good" ? ["checks"] : ["failures", "checks"]) {
+      const item = put($(host), "li", undefined, tone);
+      put(item, "span", mark, "mark").setAttribute("aria-hidden", "true");
+      const what = put(item, "span", undefined, "what");
+      put(what, "b", name);
+      what.append(` ${value}`);
+      put(item, "span", meaning, "why");
+    }
   }
 }
 
@@ -194,7 +197,7 @@ function showShaped(s, sketched) {
     lines: [...load, { y: 1, kind: "setpoint" }],
     said: `highest ${highest.toFixed(2)} after a set-point step of 1`,
   });
-  plots.command.draw({ xs: [0, end], curves: [{ x: t.time, y: t.command, kind: "command" }], lines: load });
+  plots.command.draw({ xs: [0, end], curves: [{ x: t.time, y: t.command, kind: "input" }], lines: load });
   const circle = { x: [], y: [], kind: "limit", name: `Ms ${s.ms.toFixed(2)}` };
   for (let k = 0; k <= 90; k += 1) {
     circle.x.push(-1 + Math.cos((k * Math.PI) / 45) / s.ms);
@@ -237,9 +240,11 @@ function showRefused(text) {
 
 function showSubject() {
   const subject = subjects[chosen];
-  $("name").textContent = subject.name;
-  document.title = `${subject.name} - relay_autotune`;
+  const name = live ? live.told.node : subject.name;
+  $("name").textContent = name;
+  document.title = `${name} - relay_autotune`;
   $("facts").replaceChildren();
+  if (live) put($("facts"), "li", subject.name);
   for (const text of subject.facts) put($("facts"), "li", text);
   $("shape").hidden = !subject.may_shape;
   $("calm-fast").hidden = !subject.may_shape;
@@ -255,7 +260,7 @@ function showSubject() {
     const curves = [{ x: r.measurement[0], y: r.measurement[1], kind: "measured", name: "measurement" }];
     if (r.model) curves.push({ x: r.model[0], y: r.model[1], kind: "model", name: "model" });
     plots.record.draw({ curves });
-    plots.relay.draw({ curves: [{ x: r.command[0], y: r.command[1], kind: "command" }] });
+    plots.relay.draw({ curves: [{ x: r.command[0], y: r.command[1], kind: "input" }] });
   }
   $("tabs").replaceChildren();
   const here = subjects.map((each, k) => [each, k]).filter(([each]) => each.loop === subject.loop);
@@ -336,7 +341,8 @@ function showLoop() {
   document.title = `${live.told.node} - relay_autotune`;
   $("facts").replaceChildren();
   $("gains").textContent = $("verdict").textContent = "";
-  $("marks").replaceChildren();
+  $("marks").textContent = "";
+  $("notes").hidden = true;
   saidChecks = "";
   live.showForce();
 }

@@ -136,7 +136,8 @@ export class Plot {
       });
       element("path", { class: `curve ${curve.kind}`, d }, inside);
     }
-    const taken = [];
+    // No name stands on a mark.
+    const taken = marks.map((mark) => ({ y: py(mark.y), start: px(mark.x) - 5, end: px(mark.x) + 5 }));
     for (const mark of marks) {
       const x = px(mark.x), y = py(mark.y);
       const group = element("g", { class: `mark ${mark.kind}`, transform: `translate(${x.toFixed(1)} ${y.toFixed(1)})` }, inside);
@@ -144,15 +145,22 @@ export class Plot {
       if (!mark.name) continue;
       element("title", {}, group).textContent = mark.name;
       if (this.words.pick) group.addEventListener("click", () => this.words.pick(mark.name));
-      // A name is left out where another one stands already; the pointer still finds it.
-      const long = 6.5 * mark.name.length;
-      const start = x + 8 + long > width - right ? x - 8 - long : x + 8;
-      const free = taken.every((t) => Math.abs(t.y - y) > 11 || start > t.end || start + long < t.start);
-      if (!free) continue;
-      taken.push({ y, start, end: start + long });
-      element("text", { x: start - x, y: 4 }, group).textContent = mark.name;
+      // A name stands right or left of its mark, above or below it, or is left out where others
+      // stand already; the pointer still finds it.
+      const label = element("text", { x: 0, y: 4 }, group);
+      label.textContent = mark.name;
+      const long = label.getComputedTextLength();
+      const free = [[8, 0], [-8 - long, 0], [-long / 2, -11], [-long / 2, 13]].find(([dx, dy]) => {
+        const box = { y: y + dy, start: x + dx, end: x + dx + long };
+        return box.start >= left && box.end <= width - right && taken.every((t) => Math.abs(t.y - box.y) > 13 || box.start > t.end + 3 || box.end < t.start - 3);
+      });
+      if (!free) { label.remove(); continue; }
+      taken.push({ y: y + free[1], start: x + free[0], end: x + free[0] + long });
+      label.setAttribute("x", free[0]);
+      label.setAttribute("y", 4 + free[1]);
     }
-    const named = [...bands, ...curves].filter((each) => each.name);
+    const lines = (what.names || []).map(([kind, name]) => ({ kind: `line ${kind}`, name }));
+    const named = [...bands, ...curves, ...lines].filter((each) => each.name);
     const key = named.map((each) => each.name + each.kind).join();
     if (this.key === key) return;
     this.key = key;

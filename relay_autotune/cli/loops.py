@@ -1,0 +1,285 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""What tune_loop tunes: a loop whose nodes run, or one of two topics, whose nodes it starts.
+
+A joint of ros2_control is a third kind, see `joint_tune`. The steps of a tune are the same for
+all: look at the loop, ask for what is not known, start nodes, check, tune, hand over the gains.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from relay_autotune.bag.field_path import first_numbers
+from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, ros_arguments
+from relay_autotune.cli.settings import FORM, Answers, as_flags, with_flags
+from relay_autotune.cli.terminal import Working, asked, broken, width
+from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
+from relay_autotune.exchange.export import Target
+from relay_autotune.experiment.settling import NO_REST_AT
+
+if TYPE_CHECKING:
+    from relay_autotune.loop.gains import Controller
+    from relay_autotune.nodes.tune_client import TuneClient
+
+# Purpose and text of each command that may follow.
+Steps = list[tuple[str, str]]
+# How long to wait for what a node still has to answer, and at most while a page waits [s].
+PATIENCE, _ANSWERS = 5.0, 1.0
+
+
+class Loop:
+    """A loop whose nodes run.
+
+    :param client: of its relay_node.
+    :param options: of the command line, with all answers.
+    """
+
+    form: tuple[str, ...] = ("amplitude",)
+    """Settings that may be changed before each tune."""
+    has_own_nodes = False
+    """Whether its nodes are those of this command."""
+    proves = False
+    """Whether a controller_node of this command can prove the gains."""
+
+    def __init__(self, client: TuneClient, options: argparse.Namespace) -> None:
+        self.client, self.options = client, options
+        self.answers = Answers(options)
+        self.nodes = OwnNodes()
+
+    @property
+    def title(self) -> str:
+        """The name of the loop for people."""
+        return self.client.name
+
+    def set(self, changed: dict[str, Any]) -> None:
+        """Take other values of the settings of `form`.
+
+        :param changed: the values by name.
+        :raises RelayAutotuneError: if one cannot be.
+        """
+        for name, value in changed.items():
+            if name not in self.form:
+                raise SelectionError(f"{name} is no setting of {self.title}")
+            self.answers.take(name, value, FORM[name].question)
+
+    def limits(self) -> tuple[float, ...]:
+        """Return the lowest and the highest measurement that a tune may see; empty: not known."""
+        names = ("measurement_min", "measurement_max")
+        with suppress(LoopError):
+            found = tuple(self.client.values(self.client.name, names, _ANSWERS).values())
+            return found if all(map(math.isfinite, found)) else ()
+        return ()
+
+    def plan(self) -> list[str]:
+        """Return what the loop itself has to say of a tune, as lines of a checklist."""
+        return []
+
+    def arguments(self) -> dict[str, list[str]]:
+        """Return the arguments for ROS of its own nodes, by the names of their executables."""
+        return {}
+
+    def checklist(self, checks: Sequence[str]) -> list[str]:
+        """Return the lines of relay_node's checklist as they are shown."""
+        return list(checks)
+
+    @contextmanager
+    def opened(self) -> Iterator[Callable[[int], str]]:
+        """Return, for a tune, what tells why it has to end; empty: it goes on."""
+        yield lambda _: self.nodes.why_lost("identifier_node")
+
+    def left(self) -> str:
+        """Return in which state a tune without gains has left the plant; empty: not known."""
+        return ""
+
+    def instead(self) -> str:
+        """Return what to do in place of the same tune again; empty: it may be repeated."""
+        return ""
+
+    def first(self) -> Steps:
+        """Return what has to be done before the same tune again."""
+        return []
+
+    def present(self) -> Controller | None:
+        """Return the gains in force in its controller; None: they are not known."""
+        from relay_autotune.nodes.gains_client import GainsClient
+
+        with suppress(RelayAutotuneError):
+            for name in self.client.controllers()[:1]:
+                with GainsClient("", name, beside=self.client) as loop:
+                    return loop.in_force()
+        return None
+
+    @property
+    def target(self) -> Target:
+        """Where exported gains go."""
+        return Target()
+
+    def apply(self, doubt: str) -> int | None:  # noqa: ARG002  see JointLoop
+        """Offer the gains to its controller; return the exit status, None: there is none.
+
+        :param doubt: why they are doubtful; empty: they are trusted.
+        """
+        return None
+
+
+class TopicLoop(Loop):
+    """A loop of two topics, whose nodes this command starts.
+
+    Looking at it asks on the terminal for what is not given, unless a page asks.
+
+    :param client: of the relay_node that will be started.
+    :param options: of the command line.
+    :raises LoopError: if a topic is not there, or something is not known and nobody can be asked.
+    """
+
+    form = ("at", "within", "command_within", "amplitude")
+    has_own_nodes = proves = True
+
+    def __init__(self, client: TuneClient, options: argparse.Namespace) -> None:
+        super().__init__(client, options)
+        answers, measurement, command = self.answers, options.measurement, options.command
+        with Working(f"looking at {measurement} and {command}"):
+            self._kind = client.kind_of(measurement, options.wait, published=True)
+            self._command_kind = client.kind_of(command, options.wait, published=False)
+            client.require_uncontrolled()
+        self._choose_field()
+        self._command_field = options.command_field or "data"
+        try:
+            with Working(f"listening to {measurement} and {command}"):
+                answers.measured = client.measured(measurement, self._kind, options.field)
+                answers.commanded = client.commanded(
+                    command, self._command_kind, self._command_field, options.command_message or ""
+                )
+        except ParameterError as error:
+            raise SelectionError(as_flags(str(error))) from None
+        needed = [name for name in self.form[:3] if answers[name] is None]
+        if options.web:
+            return
+        if sys.stdin.isatty() and needed:
+            print("u is the command's unit, y the measurement's", file=sys.stderr)
+        answers.ask("at", known=answers.commanded)
+        answers.ask("within")
+        if answers["command_within"] is not None or not options.amplitude:
+            # The amplitude is found between these.
+            answers.ask("command_within")
+
+    def _choose_field(self) -> None:
+        """Ask for the number that measures where the messages do not have the one of --field.
+
+        :raises SelectionError: if nobody can be asked.
+        """
+        # Imported here, because it needs ROS.
+        from relay_autotune.nodes.live_types import message_class, reader_of, struct_of
+
+        options = self.options
+        while True:
+            try:
+                reader_of(self._kind, options.field)
+                return
+            except ParameterError as error:
+                told = as_flags(str(error))
+            kind = message_class(self._kind, "measurement_type")
+            first = "".join(first_numbers(struct_of(kind), 1))
+            if not (first and sys.stdin.isatty()):
+                raise SelectionError(
+                    f"{told}: give it, such as --field {first}" if first else told
+                )
+            print("\n".join(broken(told, width())), file=sys.stderr)
+            what = "the number that measures"
+            options.field = asked(what, "--field", first, first, lambda text: text or None)
+
+    @property
+    def title(self) -> str:
+        """The name of the loop for people."""
+        return f"{self.options.measurement} -> {self.options.command}"
+
+    def arguments(self) -> dict[str, list[str]]:
+        """Return the arguments for ROS of its nodes, by the names of their executables."""
+        options, space = self.options, own_namespace(self.options)
+        values: dict[str, Any] = {
+            "measurement_type": self._kind,
+            "command_type": self._command_kind,
+            "baseline_is_present": True,
+            **self.answers.parameters(),
+            "command_field": self._command_field,
+            "amplitude": options.amplitude,
+        }
+        if others := options.command_message:
+            # The value of a parameter is YAML itself, so that this text needs quotes.
+            values["command_message"] = json.dumps(others)
+        topics = {"measurement": options.measurement, "command": options.command}
+        nodes = {"relay_node": ros_arguments(space, topics, values)}
+        if not options.record_only:
+            asked_for = {name: getattr(options, name) for name in ("law", "sample_period")}
+            given = {name: value for name, value in asked_for.items() if value is not None}
+            nodes["identifier_node"] = ros_arguments(space, values=given)
+        return nodes
+
+    def set(self, changed: dict[str, Any]) -> None:
+        """Take other values of the settings of `form`, also in relay_node."""
+        super().set(changed)
+        self.client.set_values(self.client.name, self.answers.parameters(self.form[:3]))
+
+    def checklist(self, checks: Sequence[str]) -> list[str]:
+        """Return the lines of relay_node's checklist with flags in place of its parameters."""
+        return list(map(with_flags, checks))
+
+    def limits(self) -> tuple[float, ...]:
+        """Return the lowest and the highest measurement that a tune may see; empty: not known."""
+        return tuple(self.options.within or ())
+
+    def left(self) -> str:
+        """Return at which command the loop is left, and whether that is the right one."""
+        command = self.options.at
+        if self._rests_elsewhere:
+            return (
+                f"the command stands at {command:.6g} u, which is not the one at which the "
+                f"process rested: set the right one now"
+            )
+        told = f"the plant is left at the safe command {command:.6g} u"
+        if self.left_its_limits:
+            told += ": look whether the process rests there, else set the right one now"
+        return told
+
+    def instead(self) -> str:
+        """Return what to do in place of the same tune, which would drive the process away."""
+        if self._rests_elsewhere:
+            return "start again with --at and the command at which it rests"
+        if self.left_its_limits:
+            told = "the --at at which it rests, a smaller --amplitude, or wider --within"
+            return f"start again with {told}"
+        return ""
+
+    @property
+    def _rests_elsewhere(self) -> bool:
+        """Whether the process did not rest at the command that was said to be the present one."""
+        return bool(self.client.result.reason.startswith(NO_REST_AT))
+
+    @cached_property
+    def left_its_limits(self) -> bool:
+        """Whether the last measurement of a tune that was aborted is outside of its limits."""
+        result, within = self.client.result, self.options.within
+        if result.outcome != result.ABORTED or not within:
+            return False
+        try:
+            measured = self.client.record(PATIENCE).measurement
+        except RelayAutotuneError:
+            return False
+        low, high = within
+        return measured.size > 0 and not low <= float(measured[-1]) <= high
+
+    @property
+    def target(self) -> Target:
+        """Where exported gains go: within the limits of the command, from the present one on."""
+        low, high = self.options.command_within or (-math.inf, math.inf)
+        at = math.nan if self.options.at is None else self.options.at
+        return Target(command_min=low, command_max=high, present=at)

@@ -1,0 +1,431 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a tune has to know of a loop: each setting with its flag, its question and its parameters.
+
+A setting is declared once. The command line, the questions on a terminal, the form of the page and
+the parameters of relay_node follow from its row.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+from relay_autotune.cli.arguments import finite, flag_of
+from relay_autotune.cli.terminal import asked, number_of, pair_of
+from relay_autotune.errors import SelectionError
+from relay_autotune.loop.laws import LAWS
+from relay_autotune.quantities import Quantity
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One of the settings of a loop.
+
+    :param quantity: its name, unit and help; a default of () stands for a range.
+    :param metavar: what its flag takes; empty: it follows from the quantity.
+    :param question: how it is asked for; empty: nobody asks for it.
+    :param example: what may be typed.
+    :param parameters: of relay_node that it sets, for a range the lower and the upper one.
+    """
+
+    quantity: Quantity
+    metavar: str = ""
+    question: str = ""
+    example: str = ""
+    parameters: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Its name among the options of the command."""
+        return self.quantity.name
+
+    @property
+    def flag(self) -> str:
+        """Its flag, such as --command-within."""
+        return flag_of(self.quantity)
+
+    @property
+    def is_range(self) -> bool:
+        """Whether it has a lower and an upper end."""
+        return self.quantity.default == ()
+
+    @property
+    def read(self) -> Callable[[str], Any]:
+        """Return the value of a text; None: it has none."""
+        return pair_of if self.is_range else number_of
+
+    def add_to(self, group: argparse._ArgumentGroup) -> None:
+        """Add its flag to some others."""
+        default, how = self.quantity.default, dict[str, Any]()
+        if self.is_range:
+            how = {"nargs": 2, "type": finite, "metavar": ("LOW", "HIGH")}
+        elif isinstance(default, bool):
+            # A proof may be wanted, not wanted, or asked for.
+            asks = self.name == "verify"
+            how["action"] = argparse.BooleanOptionalAction if asks else "store_true"
+            how["default"] = None if asks else False
+        elif self.quantity.choices:
+            how = {"choices": self.quantity.choices, "metavar": self.metavar}
+        else:
+            number = self.quantity.is_number
+            how["metavar"] = self.metavar or self.quantity.unit.upper()
+            how |= {"type": finite} if number else {"default": default or None}
+        group.add_argument(self.flag, dest=self.name, help=self.quantity.description, **how)
+
+    def values(self, given: Any) -> dict[str, Any]:
+        """Return the parameters of relay_node that a value sets."""
+        if self.is_range:
+            return dict(zip(self.parameters, given, strict=True))
+        return dict.fromkeys(self.parameters, given)
+
+
+SETTINGS = (
+    Setting(
+        Quantity("measurement", "").means("topic that measures"), "TOPIC",
+    ),
+    Setting(
+        Quantity("command", "").means("topic that commands the actuator"), "TOPIC",
+    ),
+    Setting(
+        Quantity("field", "data").means(
+            "the number in the messages of --measurement (%(default)s)"
+        ),
+        "PATH", "the number that measures", parameters=("measurement_field",),
+    ),
+    Setting(
+        Quantity("command_field", "").means(
+            "the number in the messages of --command, such as linear.x"
+        ),
+        "PATH", parameters=("command_field",),
+    ),
+    Setting(
+        Quantity("command_message", "").means(
+            "what stands in their other elements, such as '{data: [0.0, 1.5]}'"
+        ),
+        "YAML", parameters=("command_message",),
+    ),
+    Setting(
+        Quantity("command_period", math.nan, "s").means(
+            "send the last command again after this time, for an actuator that stops without"
+        ),
+        parameters=("command_period",),
+    ),
+    Setting(
+        Quantity("at", math.nan, "u").means("the present command, at which the process rests"),
+        # The safe command also where a controller_node in front of it has ended.
+        "", "present command, at which the process rests", "2.5", ("baseline", "safe_command"),
+    ),
+    Setting(
+        Quantity("within", (), "y").means("the tune ends where the measurement leaves these [y]"),
+        "", "lowest and highest measurement that the process may see", "30 50",
+        ("measurement_min", "measurement_max"),
+    ),
+    Setting(
+        Quantity("command_within", (), "u").means("no command beyond these is sent [u]"),
+        "", "lowest and highest command of the actuator", "0 5", ("command_min", "command_max"),
+    ),
+    Setting(
+        Quantity("law", "", choices=tuple(LAWS)).means(
+            "design the gains for the law of another program, such as simple_pid, and prove them "
+            "with that law"
+        ),
+        "LAW",
+    ),
+    Setting(
+        Quantity("sample_period", math.nan, "s").means(
+            "time between two runs of that program [s]; default: that of the measurement"
+        ),
+    ),
+    Setting(
+        Quantity("verify", False).means(
+            "prove the gains with a step of the set-point, by a controller_node of its own; "
+            "without either flag it asks, with --yes it does not"
+        ),
+    ),
+    Setting(
+        Quantity("step", math.nan, "y").means(
+            "height of that step [y]; default: half of the swing of the tune, at least twenty "
+            "times the noise (forty if that is within a third of the way to a limit), as far as "
+            "--within and --command-within allow"
+        ),
+    ),
+    Setting(
+        Quantity("yes", False).means(
+            "do not ask, for scripts; gains are then proven with --verify alone"
+        ),
+    ),
+    Setting(
+        Quantity("export", "").means(
+            "write the gains for ros2_controllers' pid_controller, or for the controller of the "
+            "joint; an existing file is refused at once"
+        ),
+        "FILE",
+    ),
+)  # fmt: skip
+SETTING = {each.name: each for each in SETTINGS}
+# What moves the plant, which the form of a page asks for; an amplitude of 0 is found by the tune.
+AMPLITUDE = Setting(
+    Quantity("amplitude", 0.0, "u").means(
+        "half the distance of the two commands [u]; default: the node's parameter"
+    ),
+    "", "half the distance of the relay's two commands; 0: found by the tune", "0",
+)  # fmt: skip
+FORM = {each.name: each for each in (*map(SETTING.get, ("at", "within", "command_within")),
+                                     AMPLITUDE) if each}  # fmt: skip
+_FLAGS = {name: each.flag for each in SETTINGS for name in each.parameters}
+# Where a checklist says which parameter of relay_node to set.
+_TYPED = re.compile(r"; type: ros2 param set \S+ (\w+) \w+$")
+
+
+def with_flags(check: str) -> str:
+    """Return a line of the checklist with the flag to give in place of a node's parameter.
+
+    :param check: the line; its node ends with the command, so that nothing can be set on it.
+    """
+    return _TYPED.sub(lambda found: f"; give {_FLAGS.get(found[1], found[1])}", check)
+
+
+def as_flags(text: str) -> str:
+    """Return an error's text with the flags in place of the parameters of the same meaning."""
+    for parameter, flag in _FLAGS.items():
+        text = re.sub(rf"\b{parameter}\b", flag, text)
+    return text
+
+
+@dataclass
+class Answers:
+    """What is known of a loop, where it comes from, and what is asked for.
+
+    :param options: as the command line gives them; answers are kept there, too.
+    :param measured: the present measurement [y]; NaN: not known.
+    :param commanded: the present command, if somebody publishes one [u]; NaN: nobody does.
+    :param units: in place of y and u, where they are known.
+    """
+
+    options: argparse.Namespace
+    measured: float = math.nan
+    commanded: float = math.nan
+    units: dict[str, str] = field(default_factory=dict)
+    _from: dict[str, str] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> Any:
+        """Return the value of a setting; None: it is not known."""
+        return getattr(self.options, name)
+
+    def take(self, name: str, value: Any, source: str) -> None:
+        """Take a value.
+
+        :param name: of the setting.
+        :param value: None: it is not known.
+        :param source: where it comes from.
+        :raises SelectionError: if it cannot be.
+        """
+        if value is not None and (why := self.why_impossible(name, value)):
+            raise SelectionError(f"{source} {_text(value)}: {why}")
+        setattr(self.options, name, value)
+        self._from[name] = source
+
+    def source(self, name: str) -> str:
+        """Return where a value comes from: its flag, unless something else was said."""
+        return self._from.get(name, FORM[name].flag)
+
+    def unit(self, name: str) -> str:
+        """Return the unit of a setting."""
+        unit = FORM[name].quantity.unit
+        return self.units.get(unit, unit)
+
+    def now(self, name: str) -> str:
+        """Return what is seen of a setting's quantity now; empty: nothing."""
+        if name == "amplitude":
+            return ""
+        value = self.measured if name == "within" else self._present_command
+        return "" if math.isnan(value) else f"{value:.6g} {self.unit(name)} now"
+
+    @property
+    def _present_command(self) -> float:
+        at = self["at"]
+        return self.commanded if at is None else float(at)
+
+    def why_impossible(self, name: str, value: Any) -> str:
+        """Return why a value cannot be, as far as is known now; empty: it can.
+
+        :param name: of the setting.
+        :param value: that is given.
+        """
+        if name == "within":
+            seen, what = self.measured, "the measurement is {} now"
+        elif name == "command_within":
+            seen, what = self._present_command, "the present command is {}"
+        elif name == "at" and (limits := self["command_within"]):
+            low, high = limits
+            told = f"expected a command from {low:g} to {high:g}, the limits of the actuator"
+            return "" if low <= value <= high else told
+        elif name == "amplitude":
+            return "" if value >= 0.0 else "expected at least 0"
+        else:
+            return ""
+        low, high = value
+        fine = math.isnan(seen) or low <= seen <= high
+        return "" if fine else f"{what.format(f'{seen:.6g}')}: give limits around it"
+
+    def ask(self, name: str, what: str = "", example: str = "", known: float = math.nan) -> None:
+        """Ask for a value that is not known yet, and refuse one that cannot be.
+
+        :param name: of the setting.
+        :param what: how it is asked for; empty: as its row says.
+        :param example: what may be typed; empty: as its row says.
+        :param known: what Enter takes; NaN: nothing.
+        """
+        setting = FORM[name]
+        if self[name] is not None:
+            self.take(name, self[name], self.source(name))
+            return
+        shown = "" if math.isnan(known) else f"{known:.6g}"
+        example = example or shown or setting.example
+        seen = "" if shown else self.now(name)
+        question = f"{what or setting.question} [{self.unit(name)}]" + f", {seen}" * bool(seen)
+        value = asked(
+            question, setting.flag, shown, example, setting.read,
+            lambda found: self.why_impossible(name, found),
+        )  # fmt: skip
+        self.take(name, value, "typed")
+
+    def form(self, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+        """Yield each of some settings as a form shows it.
+
+        :param names: of the settings.
+        """
+        for name in names:
+            setting, value = FORM[name], self[name]
+            if value is None and name == "at" and not math.isnan(self.commanded):
+                value = float(f"{self.commanded:.6g}")
+            yield {
+                "name": name,
+                "question": setting.question,
+                "unit": self.unit(name),
+                "values": value if setting.is_range else [value],
+                "ends": 1 + setting.is_range,
+                "now": self.now(name),
+            }
+
+    def parameters(self, names: Collection[str] = tuple(SETTING)) -> dict[str, Any]:
+        """Return the parameters of relay_node that the known values set."""
+        found: dict[str, Any] = {}
+        for name in names:
+            if (value := self[name]) is not None:
+                found |= SETTING[name].values(value)
+        return found
+
+
+def _text(value: Any) -> str:
+    values = value if isinstance(value, Sequence) else [value]
+    return " ".join(f"{each:g}" for each in values)
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of a loop that has no nodes yet.
+
+    :param parser: of tune_loop.
+    """
+    group = parser.add_argument_group(
+        "a loop without nodes",
+        "with --measurement and --command it starts relay_node and identifier_node itself, asks "
+        "for what it must know, shows the plan, tunes, and ends them",
+    )
+    for each in SETTINGS:
+        each.add_to(group)
+
+
+def add_joint(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of a joint of ros2_control.
+
+    :param parser: of tune_loop.
+    """
+    group = parser.add_argument_group(
+        "a joint of ros2_control",
+        "with --controller and --joint it finds topics, limits and gains by itself, tunes, and "
+        "applies and verifies the gains",
+    )
+    group.add_argument(
+        "--controller", metavar="NAME",
+        help="an active pid_controller, or with --open a joint_trajectory_controller; of several "
+        "robots with its namespace, such as /robot1/wheel_pid",
+    )  # fmt: skip
+    group.add_argument("--joint", metavar="NAME", help="the joint, or degree of freedom")
+    group.add_argument(
+        "--controller-manager", default="", metavar="NAME",
+        help="full name of the controller_manager; default: the only one that is there",
+    )  # fmt: skip
+    group.add_argument(
+        "--open", action="store_true",
+        help="switch its controllers off for the tune, and command the joint itself; default: "
+        "the controller stays active, and its reference is moved",
+    )  # fmt: skip
+    group.add_argument(
+        "--forward", metavar="NAME",
+        help="with --open: the controller that passes commands on; default: found",
+    )  # fmt: skip
+    group.add_argument(
+        "--keep-gains", action="store_true", help="leave the gains of the controller as they are"
+    )
+
+
+class Kind(Enum):
+    """What a loop has: its nodes, its two topics alone, or a joint of ros2_control."""
+
+    NODES = "nodes"
+    TOPICS = "topics"
+    JOINT = "joint"
+
+
+# Flags of a loop without nodes that a joint takes with --open alone, and those it never takes.
+_OF_OPENED = ("measurement", "at", "command_within", "command_message", "forward")
+_OF_TOPICS = (
+    "command", "command_field", "command_period", "verify", "step", "law", "sample_period",
+)  # fmt: skip
+
+
+def kind_of(options: argparse.Namespace) -> Kind:
+    """Return which kind of loop is to be tuned.
+
+    :param options: with the flags of `add_settings` and `add_joint`.
+    :raises SelectionError: if the flags do not go together.
+    """
+    of_joint = options.open or options.forward or options.keep_gains or options.controller_manager
+    if options.controller or options.joint:
+        _require_joint(options)
+        return Kind.JOINT
+    if of_joint:
+        raise SelectionError("--open and the like are for a joint: give --controller, --joint")
+    if options.measurement and options.command:
+        return Kind.TOPICS
+    for each in SETTINGS:
+        # One with a default is not told from one that is not given.
+        if each.name not in ("field", "yes") and getattr(options, each.name) is not None:
+            raise SelectionError(
+                f"{each.flag} is for a loop without nodes: give --measurement and --command, too"
+            )
+    return Kind.NODES
+
+
+def _require_joint(options: argparse.Namespace) -> None:
+    if not (options.controller and options.joint):
+        raise SelectionError("--controller and --joint go together: give both")
+    if options.web or (options.json and not (options.keep_gains or options.dry_run)):
+        raise SelectionError(
+            "a joint is tuned in the terminal: leave out --web, and --json without --keep-gains"
+        )
+    for name in (*_OF_TOPICS, *(() if options.open else _OF_OPENED)):
+        if getattr(options, name) is not None:
+            what = "a loop of two topics" if name in _OF_TOPICS else "--open"
+            raise SelectionError(
+                f"--{name.replace('_', '-')} is for {what}: leave it out, since the controller "
+                f"tells it"
+            )
