@@ -227,8 +227,11 @@ class Answers:
         :param source: where it comes from.
         :raises SelectionError: if it cannot be.
         """
-        if value is not None and (why := self.why_impossible(name, value)):
-            raise SelectionError(f"{source} {_text(value)}: {why}")
+        if value is not None:
+            # A page sends whole numbers as such, which ROS does not take for a double.
+            value = list(map(float, value)) if FORM[name].is_range else float(value)
+            if why := self.why_impossible(name, value):
+                raise SelectionError(f"{source} {_text(value)}: {why}")
         setattr(self.options, name, value)
         self._from[name] = source
 
@@ -246,7 +249,7 @@ class Answers:
         if name == "amplitude":
             return ""
         value = self.measured if name == "within" else self._present_command
-        return "" if math.isnan(value) else f"{value:.6g} {self.unit(name)} now"
+        return "" if math.isnan(value) else f"{value:.4g} {self.unit(name)} now"
 
     @property
     def _present_command(self) -> float:

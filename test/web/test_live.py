@@ -193,7 +193,9 @@ def test_nobody_who_looks_does_not_make_what_is_new_grow(monkeypatch):
 @pytest.mark.browser
 def test_the_page_of_a_loop_with_hostile_texts(tmp_path):
     live = Live(HOSTILE)
-    live.tell(status=HOSTILE, checks=((HOSTILE, HOSTILE, HOSTILE),), cycles=(HOSTILE,), result=(HOSTILE,))
+    live.tell(
+        status=HOSTILE, checks=((HOSTILE, HOSTILE, HOSTILE),), cycles=(HOSTILE,), result=(HOSTILE,)
+    )
     with served([], live=live) as url, Chromium(tmp_path) as browser:
         tab = browser.tab(url)
         tab.wait("document.body.dataset.phase === 'idle'")
