@@ -19,7 +19,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from relay_autotune.cli.apply_gains import found_lines
+from relay_autotune.cli.apply_gains import found_entries
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, as_typed, exit_status, say
 from relay_autotune.cli.loops import PATIENCE, Loop, Steps
 from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN, ranges, ros_arguments
@@ -400,7 +400,9 @@ class AfterTune:
                     found = proof.made(controller, step, shown, leave)
             finally:
                 shown.clear()
-            print("\n" + "\n".join(found_lines(found, width(), proof.noise_std)), flush=True)
+            print()
+            for entry in found_entries(found, proof.noise_std):
+                tell(*entry)
             if proof.rate is not None:
                 tell(
                     "law",

@@ -31,8 +31,8 @@ from relay_autotune.cli.terminal import (
     agreed_step,
     agrees,
     in_columns,
-    labelled,
     noted,
+    tell,
     width,
     write,
 )
@@ -211,18 +211,17 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
             result = client.prove(step, options.load, options.wait, shown, leave, new)
         finally:
             shown.clear()
-        columns = width()
         try:
             now = client.in_force()
             unproven = not result.passed and new is not None and client.has(new)
-            lines = verdict_lines(
-                result, now, columns, stays=options.stays, noise_std=noise, unproven=unproven
+            entries = verdict_entries(
+                result, now, stays=options.stays, noise_std=noise, unproven=unproven
             )
         except LoopError as error:
-            lines = found_lines(result, columns, noise)
             told = f"not known: {error}; before the proof: {_numbers(present)}"
-            lines += labelled("gains in force", told, columns)
-        print("\n".join(lines))
+            entries = [*found_entries(result, noise), ("gains in force", told)]
+        for entry in entries:
+            tell(*entry)
     return DONE if result.passed else NOTHING_FOUND
 
 
@@ -281,20 +280,18 @@ def _performance(present: Controller | None, model: TransferFunction) -> Perform
         return None
 
 
-def verdict_lines(
+def verdict_entries(
     result: Any,
     present: Controller | None,
-    columns: int,
     *,
     stays: bool = True,
     noise_std: float = math.nan,
     unproven: bool = False,
-) -> list[str]:
-    """Return what a verification has found, in a line for each step and three more.
+) -> list[tuple[str, str]]:
+    """Return what a verification has found, and the gains in force after it: names and texts.
 
     :param result: the `Verify.Result`.
     :param present: the gains in force after it.
-    :param columns: that a line may have.
     :param stays: True if the controller_node goes on running.
     :param noise_std: of the measurement [y]; NaN: not known.
     :param unproven: True if the gains in force are new ones that have not passed.
@@ -304,7 +301,7 @@ def verdict_lines(
         now += f"; {PROGRAM} --revert takes those before"
     if unproven:
         now += "; these are the new ones, which are not proven: set those before yourself"
-    return found_lines(result, columns, noise_std) + labelled("gains in force", now, columns)
+    return [*found_entries(result, noise_std), ("gains in force", now)]
 
 
 def _numbers(gains: Controller | None) -> str:
@@ -313,11 +310,10 @@ def _numbers(gains: Controller | None) -> str:
     return ", ".join(f"{n} {digits(getattr(gains, n))}" for n, _ in _FIGURES[:3])
 
 
-def found_lines(result: Any, columns: int, noise_std: float = math.nan) -> list[str]:
-    """Return verdict, response to each step and process of a verification.
+def found_entries(result: Any, noise_std: float = math.nan) -> list[tuple[str, str]]:
+    """Return verdict, response to each step and process of a verification: names and texts.
 
     :param result: the `Verify.Result`.
-    :param columns: that a line may have.
     :param noise_std: of the measurement [y]; NaN: not known.
     """
     from relay_autotune.control.verification import NARROWLY, NOISE_ALLOWANCE
@@ -328,19 +324,19 @@ def found_lines(result: Any, columns: int, noise_std: float = math.nan) -> list[
     reasons = [step.reason.partition("; ")[0] for step in result.steps]
     if narrow := [r.removeprefix(NARROWLY) for r in reasons if r.startswith(NARROWLY)]:
         told = f"passed, {NARROWLY}{'; '.join(narrow)}" if result.passed else told
-    lines = labelled("verdict", told, columns)
+    found = [("verdict", told)]
     for step in result.steps:
         setpoint = step.kind == step.SETPOINT
         moved = NOISE_ALLOWANCE * noise_std / abs(step.step) if setpoint else 0.0
         unsure = f" +- {100.0 * moved:.0f}" if moved > _SEEN else ""
-        lines += labelled(
-            "set-point step" if setpoint else "load step",
+        name = "set-point step" if setpoint else "load step"
+        text = (
             f"{step.step:+g} {'y' if setpoint else 'u'}: overshoot "
             f"{100.0 * step.overshoot:.0f}{unsure} % "
             f"(predicted {100.0 * step.overshoot_predicted:.0f} %), settled after "
-            f"{duration(step.settling_time)} (predicted {duration(step.settling_time_predicted)})",
-            columns,
+            f"{duration(step.settling_time)} (predicted {duration(step.settling_time_predicted)})"
         )
+        found.append((name, text))
     if result.steps:
         gain, ms = (
             " and ".join(f"{getattr(step, name):.2f}" for step in result.steps)
@@ -348,8 +344,8 @@ def found_lines(result: Any, columns: int, noise_std: float = math.nan) -> list[
         )
         predicted = result.steps[0].ms_predicted
         told = f"gain {gain} times the model's, Ms {ms} (predicted {predicted:.2f})"
-        lines += labelled("process", told, columns)
-    return lines
+        found.append(("process", told))
+    return found
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
 
-from relay_autotune.cli.apply_gains import found_lines, verdict_lines
+from relay_autotune.cli.apply_gains import found_entries, verdict_entries
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, exit_status, say, worst
 from relay_autotune.cli.loops import Loop
 from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN
@@ -245,7 +245,8 @@ class _LoopOnPage:
             self._at_first = lambda: stack.enter_context(self._commands_shown())
             follow(client, self, self._ends, _TICK)
             self._terminal.clear()
-        live.tell(window=(live.told.window[0], live.now))
+        if not live.told.window[1]:
+            live.tell(window=(live.told.window[0], live.now))
         result = client.result
         for refused in sorted(client.refused):
             say(PROGRAM, refused)
@@ -278,7 +279,11 @@ class _LoopOnPage:
             self._at_first()
             self._at_first = None
         told, state = self._live.told, STATES[feedback.state]
+        begun, ended = told.window
+        if state in _TONES and not ended:
+            ended = self._live.now
         changed: dict[str, Any] = {
+            "window": (begun, ended),
             "state": state,
             "tone": _TONES.get(state, ""),
             "status": feedback.status,
@@ -394,8 +399,6 @@ _REST_WITHIN = 60.0
 _FOUND_WITHIN = 5.0
 # Interval at which the gains in force are read while nothing else happens [s].
 _LOOK_EVERY = 3.0
-# Columns of the verdict on a verification.
-_COLUMNS = 60
 
 
 @dataclass
@@ -541,7 +544,7 @@ class GainsPage:
         live.rest(
             f"proof {'passed' if result.passed else 'failed'}: {result.reason}; {left}",
             good=result.passed,
-            proof=tuple(found_lines(result, _COLUMNS, proof.noise_std)),
+            proof=tuple(found_entries(result, proof.noise_std)),
         )
 
     def _message(self, wish: PageCommand) -> Any:
@@ -572,7 +575,7 @@ class GainsPage:
         live.rest(
             f"verification {'passed' if result.passed else 'failed'}: {result.reason}",
             good=result.passed,
-            proof=tuple(verdict_lines(result, present, _COLUMNS)),
+            proof=tuple(verdict_entries(result, present)),
         )
 
 

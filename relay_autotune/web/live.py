@@ -87,7 +87,7 @@ class Told:
     :param present: its gains, in words.
     :param proves: whether a controller_node of the command can prove gains.
     :param step: of its set-point that verifies gains as usual [y]; NaN: not known.
-    :param proof: lines of the last verification.
+    :param proof: of the last verification: names and texts.
     """
 
     node: str
@@ -114,7 +114,7 @@ class Told:
     present: str = ""
     proves: bool = False
     step: float = math.nan
-    proof: tuple[str, ...] = ()
+    proof: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass

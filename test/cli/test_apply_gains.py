@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 
 from relay_autotune.cli import apply_gains
-from relay_autotune.cli.apply_gains import beside, found_lines, verdict_lines
+from relay_autotune.cli.apply_gains import beside, found_entries, verdict_entries
+from relay_autotune.cli.terminal import labelled
 from relay_autotune.cli.tune_page import GainsPage
 from relay_autotune.control.verification import StepRange
 from relay_autotune.errors import LoopError, TuningError
@@ -32,6 +33,11 @@ MODEL = TransferFunction.fopdt(1.65, 1.0, 0.5)
 GAINS = design(DesignTask(model=MODEL, options=DesignOptions()), "imc")
 MESSAGE = PidGains()
 fill_gains(MESSAGE, GAINS, experiment_id="x")
+
+
+def laid_out(entries: list[tuple[str, str]], columns: int) -> list[str]:
+    """Return the lines that a terminal of some columns shows."""
+    return [line for entry in entries for line in labelled(*entry, columns)]
 
 
 def step(**values: Any) -> Any:
@@ -64,7 +70,7 @@ def test_gains_that_are_missing_or_unstable_are_told_as_such() -> None:
 def test_a_verdict_has_five_lines() -> None:
     load = step(kind=Verification.LOAD, step=0.3, gain_ratio=1.01)
     result = Verify.Result(passed=True, reason="long numbers", steps=[step(), load])
-    lines = verdict_lines(result, Controller(0.6, 0.75, 0.2, 0.02), 99)
+    lines = laid_out(verdict_entries(result, Controller(0.6, 0.75, 0.2, 0.02)), 99)
     assert len(lines) == 5
     assert "passed: the loop does what the model predicts" in lines[0]
     told = "overshoot 10 % (predicted 11 %), settled after 3.8 s (predicted 4.2 s)"
@@ -76,14 +82,18 @@ def test_a_verdict_has_five_lines() -> None:
 
 def test_an_overshoot_that_the_noise_could_move_has_its_uncertainty() -> None:
     result = Verify.Result(passed=True, reason="long", steps=[step()])
-    assert "overshoot 10 +- 6 % (predicted 11 %)" in "\n".join(found_lines(result, 99, 0.01))
-    assert "overshoot 10 % (predicted 11 %)" in "\n".join(found_lines(result, 99, 0.004))
+    assert "overshoot 10 +- 6 % (predicted 11 %)" in "\n".join(
+        laid_out(found_entries(result, 0.01), 99)
+    )
+    assert "overshoot 10 % (predicted 11 %)" in "\n".join(
+        laid_out(found_entries(result, 0.004), 99)
+    )
 
 
 def test_what_passed_close_to_a_limit_is_called_narrow() -> None:
     close = step(reason="narrowly: the gain is 0.66 times the model's, 0.6 to 1.7 passes; numbers")
     result = Verify.Result(passed=True, reason="long", steps=[step(), close])
-    first = verdict_lines(result, None, 99)[0]
+    first = laid_out(verdict_entries(result, None), 99)[0]
     assert first.split(maxsplit=1)[1] == (
         "passed, narrowly: the gain is 0.66 times the model's, 0.6 to 1.7 passes"
     )
@@ -91,10 +101,10 @@ def test_what_passed_close_to_a_limit_is_called_narrow() -> None:
 
 def test_a_verdict_that_failed_says_why_and_which_gains_are_back() -> None:
     failed = Verify.Result(passed=False, reason="it settles later; kc 0.1 in force again")
-    text = "\n".join(verdict_lines(failed, Controller(0.1, 3.0), 60))
+    text = "\n".join(laid_out(verdict_entries(failed, Controller(0.1, 3.0)), 60))
     assert "failed: it settles later" in text
     assert "kc 0.1000" in text and "--revert" not in text
-    assert "the command is held" in "\n".join(verdict_lines(failed, None, 60))
+    assert "the command is held" in "\n".join(laid_out(verdict_entries(failed, None), 60))
 
 
 def test_the_result_of_a_step_carries_no_samples() -> None:

@@ -199,7 +199,7 @@ def test_the_page_of_a_loop_with_hostile_texts(tmp_path):
     with served([], live=live) as url, Chromium(tmp_path) as browser:
         tab = browser.tab(url)
         tab.wait("document.body.dataset.phase === 'idle'")
-        assert tab.text("#live-title") == HOSTILE
+        assert tab.text("#name") == HOSTILE
         assert tab.text("#live-status") == HOSTILE
         assert tab.eval("document.querySelectorAll('img, main script').length") == 0
         assert tab.eval("document.title") == f"{HOSTILE} - relay_autotune"
@@ -310,7 +310,7 @@ def test_each_loop_has_a_tab_and_every_one_that_runs_can_be_ended(tmp_path):
     with served([subject], lives=lives) as url, Chromium(tmp_path) as browser:
         tab = browser.tab(url)
         tab.wait("document.querySelectorAll('#loops button').length === 2")
-        assert tab.text("#live-title") == "/tank/relay_node"
+        assert tab.text("#name") == "/tank/relay_node"
         assert not tab.text("#gains")
         # gains of another loop are not offered, and a question makes way for a tune
         assert tab.eval("document.querySelector('#apply').disabled")
@@ -326,6 +326,6 @@ def test_each_loop_has_a_tab_and_every_one_that_runs_can_be_ended(tmp_path):
         tab.wait("document.querySelector('#gains').innerText.startsWith('kc')")
         assert not tab.eval("document.querySelector('#abort').disabled")
         tab.click("#loops button:nth-child(1)")
-        tab.wait("document.querySelector('#live-title').innerText === '/tank/relay_node'")
+        tab.wait("document.querySelector('#name').innerText === '/tank/relay_node'")
         assert not tab.text("#gains")
         assert tab.said == []

@@ -289,11 +289,13 @@ export class Live {
     }
     const held = command.count ? command.now : null;
     const said = (signal, unit) => `now ${signal.count ? signal.now.toPrecision(4) : "none"} ${unit}`;
+    const ys = reach(within(measurement, xs), limits, lines.map((line) => line.y));
+    const bounds = limits.filter((y) => ys && y >= ys[0] && y <= ys[1]);
     this.plots.measurement.draw({
-      xs, ys: reach(within(measurement, xs), limits, lines.map((line) => line.y)), said: said(measurement, "y"),
+      xs, ys, said: said(measurement, "y"),
       curves: [{ ...measurement.curve, kind: "measured", name: "measurement" }],
-      lines: [...lines, ...limits.map((y) => ({ y, kind: "bound" }))],
-      names: [["bound", limits.length ? "limits of the tune" : ""], ["setpoint", lines.length ? "set-point, with the relay's band" : ""]],
+      lines: [...lines, ...bounds.map((y) => ({ y, kind: "bound" }))],
+      names: [["bound", bounds.length ? "limits of the tune" : ""], ["setpoint", lines.length ? "set-point, with the relay's band" : ""]],
     });
     this.plots.command.draw({
       xs, ys: reach(within(command, xs), [], held === null ? levels : [...levels, held]), said: said(command, "u"),
@@ -307,8 +309,7 @@ export class Live {
   show(before) {
     const told = this.told;
     $("live").hidden = false;
-    $("live-bar").hidden = false;
-    $("live-title").textContent = told.node;
+    $("live-bar").hidden = !this.loop.running;
     const tuning = told.phase === "tuning";
     const state = tuning ? told.state || "asked" : told.phase === "idle" ? IDLE[told.tone] : told.phase;
     if ($("live-state").textContent !== state) $("live-state").textContent = state;
@@ -339,8 +340,7 @@ export class Live {
     for (const id of ["apply", "apply-only", "verify", "revert"]) $(id).hidden = !runs;
     $("prove").hidden = runs;
     if (told.step !== null && (!before || before.step !== told.step)) $("step").value = told.step;
-    $("force-proof").hidden = !told.proof.length;
-    $("force-proof").textContent = told.proof.join("\n");
+    table($("force-proof"), told.proof, ["", "text"]);
     this.showForce();
   }
 
@@ -371,7 +371,8 @@ export class Live {
     const { cycle, value, low, high } = model.gains;
     const sure = low.map((each, k) => k).filter((k) => low[k] !== null);
     const of = (values) => sure.map((k) => values[k]);
-    $("plot-ku").hidden = !cycle.length;
+    // One value is in the table already.
+    $("plot-ku").hidden = cycle.length < 2;
     this.ultimate.draw({
       marks: cycle.map((x, k) => ({ x, y: value[k], kind: "point", name: "" })),
       bands: [{ x: of(cycle), low: of(low), high: of(high), name: "95 % interval" }],

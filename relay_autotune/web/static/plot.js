@@ -150,7 +150,7 @@ export class Plot {
       const label = element("text", { x: 0, y: 4 }, group);
       label.textContent = mark.name;
       const long = label.getComputedTextLength();
-      const free = [[8, 0], [-8 - long, 0], [-long / 2, -11], [-long / 2, 13]].find(([dx, dy]) => {
+      const free = [[9, 0], [-9 - long, 0], [-long / 2, -14], [-long / 2, 14]].find(([dx, dy]) => {
         const box = { y: y + dy, start: x + dx, end: x + dx + long };
         return box.start >= left && box.end <= width - right && taken.every((t) => Math.abs(t.y - box.y) > 13 || box.start > t.end + 3 || box.end < t.start - 3);
       });
