@@ -20,6 +20,8 @@ _FINEST = 5e-5
 
 # Interval at which users are told what is waited for [s]: below a second on a busy machine, too.
 TOLD_EVERY = 0.8
+# The same in a log, which nobody watches line by line [s].
+LOGGED_EVERY = 10.0
 
 
 def digits(value: float, count: int = 4) -> str:

@@ -148,6 +148,12 @@ class Judgement:
         return None if found is None or found.result is Result.PASSED else found
 
     @property
+    def passed(self) -> str:
+        """How many of the checks have passed, such as "15 of 15 checks passed"."""
+        count = sum(f.result is Result.PASSED for f in self.findings)
+        return f"{count} of {len(self.findings)} checks passed"
+
+    @property
     def contradicted(self) -> bool:
         """Whether the record contradicts the model: a check failed."""
         return any(f.result is Result.FAILED for f in self.findings)

@@ -336,12 +336,14 @@ class AfterTune:
             command = shlex.join(["relay_node", "--ros-args", *words])
             steps.append(("pass its commands on", prefix() + command))
         # The folder of the recording keeps what belongs to the tune.
-        bag, given = self.result.bag, ros_arguments("", topics, values)
+        bag, words = (
+            self.result.bag,
+            [CONTROLLER, "--ros-args", *ros_arguments("", topics, values)],
+        )
         if bag and Path(bag).is_dir():
             file = str(Path(bag, f"{CONTROLLER}.yaml"))
-            write(node_parameters(gains, values), file)
-            given = [*ros_arguments("", topics), "--params-file", file]
-        words = [CONTROLLER, "--ros-args", *given]
+            write(node_parameters(gains, values, topics), file)
+            words = [CONTROLLER, "--gains", file]
         return [("control with these gains", prefix() + shlex.join(words)), *steps]
 
     # Their proof.

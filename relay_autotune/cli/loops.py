@@ -282,4 +282,6 @@ class TopicLoop(Loop):
         """Where exported gains go: within the limits of the command, from the present one on."""
         low, high = self.options.command_within or (-math.inf, math.inf)
         at = math.nan if self.options.at is None else self.options.at
-        return Target(command_min=low, command_max=high, present=at)
+        topics = {"measurement": self.options.measurement}
+        topics["controller_command"] = self.options.command
+        return Target(command_min=low, command_max=high, present=at, topics=topics)

@@ -146,7 +146,7 @@ def _verdict(judgement: Judgement) -> list[_Entry]:
         # The worst finding is shown where the gains would be.
         worse = [f for f in worse if f is not judgement.worst]
     return [
-        ("verdict", judgement.verdict.name.lower()),
+        ("verdict", ", ".join([judgement.verdict.name.lower(), judgement.passed])),
         *((f"  {found.title.lower()}", found.said) for found in worse),
     ]
 

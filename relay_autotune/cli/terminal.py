@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError
-from relay_autotune.text import TOLD_EVERY, duration, visible
+from relay_autotune.text import LOGGED_EVERY, TOLD_EVERY, duration, visible
 
 if TYPE_CHECKING:
     from relay_autotune.control.verification import StepRange
@@ -181,15 +181,23 @@ _INTERVAL = 0.2
 
 
 class StatusLine:
-    """What is done or waited for, on standard error: in place on a terminal, else line by line."""
+    """What is done or waited for, on standard error: in place on a terminal, else line by line.
+
+    In a log only what begins, up to the first comma, and a line each ten seconds are shown.
+    """
 
     def __init__(self) -> None:
         self.in_place = sys.stderr.isatty()
         self._shown = False
+        self._last, self._at = "", -math.inf
 
     def __call__(self, status: str) -> None:
         """Show a sentence."""
-        status = visible(status)
+        status, now = visible(status), time.monotonic()
+        begun = status.partition(",")[0]
+        if not self.in_place and begun == self._last and now - self._at < LOGGED_EVERY:
+            return
+        self._last, self._at = begun, now
         text = f"\r\x1b[K{status[: width() - 1]}" if self.in_place else f"{status}\n"
         # The work goes on even if this cannot be written.
         with suppress(OSError):
@@ -286,9 +294,9 @@ class Working:
 
     def _tell(self) -> None:
         began, line = time.monotonic(), StatusLine()
-        wait = min(_SOON, TOLD_EVERY) if line.in_place else TOLD_EVERY
+        wait = _SOON if line.in_place else TOLD_EVERY
         while not self._over.wait(wait):
-            wait = TOLD_EVERY
+            wait = TOLD_EVERY if line.in_place else LOGGED_EVERY
             line(f"{self._what}, {duration(time.monotonic() - began)}{self._stage}")
         line.clear()
 

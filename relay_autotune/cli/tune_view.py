@@ -26,7 +26,7 @@ from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import transfer_function_from_message
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
-from relay_autotune.text import digits, duration
+from relay_autotune.text import LOGGED_EVERY, digits, duration
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -334,16 +334,20 @@ class Shown:
         self._paint = Paint(wants_colour(live, os.environ), blocks)
         self._lines = 0
         self._last: Any = None
-        self._came = 0.0
+        self._came = self._logged = 0.0
 
     def take(self, feedback: Any) -> None:
         """Show a feedback."""
+        now, last = time.monotonic(), self._last
         if not self._live:
-            self._write(f"{log_line(feedback, self._last)}\n")
-        elif self._last is not None and not feedback.transfer_function.experiment_id:
+            begins = last is None or (feedback.state, feedback.cycle) != (last.state, last.cycle)
+            if begins or now - self._logged >= LOGGED_EVERY:
+                self._write(f"{log_line(feedback, last)}\n")
+                self._logged = now
+        elif last is not None and not feedback.transfer_function.experiment_id:
             # A model comes only once.
-            feedback.transfer_function = self._last.transfer_function
-        self._last, self._came = feedback, time.monotonic()
+            feedback.transfer_function = last.transfer_function
+        self._last, self._came = feedback, now
 
     def tick(self) -> None:
         """Update the times on a terminal."""

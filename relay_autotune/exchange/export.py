@@ -14,7 +14,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from relay_autotune.errors import ParameterError, SelectionError
@@ -25,7 +25,8 @@ from relay_autotune.quantities import told_fields
 _DIGITS = 10
 # Gains that are for no law in particular can be exported for this one.
 WITHOUT_LAW = "pid_controller"
-EXPORTS = (*LAWS, "yaml")
+LAUNCH = "launch"
+EXPORTS = (*LAWS, "yaml", LAUNCH)
 _DOF = re.compile(r"[\w.-]+(/[\w.-]+)*\Z", re.ASCII)
 # Names that YAML reads as text without quotes.
 _PLAIN = re.compile(r"[A-Za-z_]\w*(/\w+)*\Z", re.ASCII)
@@ -41,6 +42,7 @@ class Target:
     :param command_min: lower clamp of the command [u]; -inf: none.
     :param command_max: upper clamp of the command [u]; inf: none.
     :param present: the command at which the process rests [u]; NaN: not known.
+    :param topics: names of the topics of a controller_node, by their names without a remapping.
     :param is_set_up: True if the gains are for its rate and its strategy against windup, which a
         joint_trajectory_controller cannot change while it runs.
     :raises SelectionError: if a name cannot be that of a node or parameter, or a clamp is NaN or
@@ -52,6 +54,7 @@ class Target:
     command_min: float = -math.inf
     command_max: float = math.inf
     present: float = math.nan
+    topics: Mapping[str, str] = field(default_factory=dict)
     is_set_up: bool = False
 
     def __post_init__(self) -> None:
@@ -72,13 +75,15 @@ def exported(gains: Gains, how: str, target: Target, *, doubt: str = "") -> str:
     """Return gains as the text of a file.
 
     :param gains: what is to be loaded.
-    :param how: a law of :data:`~relay_autotune.loop.laws.LAWS`, or "yaml".
+    :param how: a law of :data:`~relay_autotune.loop.laws.LAWS`, "yaml" or "launch".
     :param target: for a controller of ros2_controllers: where they go.
     :param doubt: what to look at before they are used; empty: they are trusted.
     :raises SelectionError: if they are for another law.
     """
     if how == "yaml":
         return _doubted(plain(gains), doubt, "#")
+    if how == LAUNCH and gains.law in ("", OWN_LAW):
+        return _doubted(launch_file(gains, target), doubt, "#")
     if how not in ((gains.law,) if gains.law else (WITHOUT_LAW, OWN_LAW)):
         runs = gains.law or "controller_node, as a continuous controller"
         raise SelectionError(f"the gains are for {runs}: give --law {how} to export them for it")
@@ -93,7 +98,8 @@ def exports_of(law: str) -> tuple[str, ...]:
 
     :param law: its name; empty: none was named.
     """
-    return (law or WITHOUT_LAW, "yaml")
+    launched = (LAUNCH,) if law in ("", OWN_LAW) else ()
+    return (law or WITHOUT_LAW, "yaml", *launched)
 
 
 def _doubted(text: str, doubt: str, remark: str) -> str:
@@ -163,15 +169,67 @@ def settings(gains: Gains, law: Law, target: Target) -> str:
     return _written(law, _comments(gains, told, law.remark), values)
 
 
-def node_parameters(gains: Gains, values: Mapping[str, Any]) -> str:
+def node_parameters(gains: Gains, values: Mapping[str, Any], topics: Mapping[str, str]) -> str:
     """Return the parameters of a controller_node as a file that it is started with.
+
+    ROS itself takes the parameters alone; `controller_node --gains FILE` takes the topics, too.
 
     :param gains: that are among them.
     :param values: the parameters by name.
+    :param topics: names of its topics, by their names without a remapping.
     """
     law = LAWS[OWN_LAW]
     texts = [(n, number(v) if isinstance(v, float) else json.dumps(v)) for n, v in values.items()]
-    return _written(law, _comments(gains, (), law.remark), texts)
+    told = ("controller_node --gains FILE",)
+    text = _written(law, _comments(gains, told, law.remark), texts)
+    if not topics:
+        return text
+    lines = (law.line.format(name=name, value=json.dumps(to)) for name, to in topics.items())
+    return "\n".join([f"{text}{TOPICS}:", "  ros__parameters:", *lines]) + "\n"
+
+
+# The section of that file which no node has, for the names of topics.
+TOPICS = "/topics"
+
+
+def launch_file(gains: Gains, target: Target) -> str:
+    """Return a launch file that starts a controller_node with gains.
+
+    :param gains: of its own law.
+    :param target: its topics, and the limits and the present value of its command.
+    """
+    values = {n: float(f"{getattr(gains, n):.{_DIGITS}g}") for n in ("kc", "ti", "td", "tf", "b")}
+    given = {
+        "initial_command": target.present,
+        "command_min": target.command_min,
+        "command_max": target.command_max,
+    }
+    values |= {name: value for name, value in given.items() if math.isfinite(value)}
+    shown = [f"                    {json.dumps(n)}: {v!r}," for n, v in values.items()]
+    topics = [f"                    {(name, to)!r}," for name, to in target.topics.items()]
+    lines = [
+        *_comments(gains, ("ros2 launch FILE",), "#"),
+        "from launch import LaunchDescription",
+        "from launch_ros.actions import Node",
+        "",
+        "",
+        "def generate_launch_description():",
+        "    return LaunchDescription(",
+        "        [",
+        "            Node(",
+        '                package="relay_autotune",',
+        '                executable="controller_node",',
+        "                parameters=[{",
+        *shown,
+        "                }],",
+        "                remappings=[",
+        *topics,
+        "                ],",
+        "            ),",
+        "        ]",
+        "    )",
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def _written(law: Law, comments: list[str], values: Sequence[tuple[str, str]]) -> str:

@@ -1,11 +1,15 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""controller_node: a PI or PID controller that takes new gains when it is told to."""
+"""controller_node: a PI or PID controller that takes new gains when it is told to.
+
+controller_node --gains FILE starts it with the parameters and topics that tune_loop has written.
+"""
 
 from __future__ import annotations
 
 import math
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -28,6 +32,7 @@ from relay_autotune.errors import (
 )
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.nodes import quality, tables
+from relay_autotune.nodes.gains_file import with_gains_file
 from relay_autotune.nodes.gains_keeper import GainsJournal, GainsKeeper
 from relay_autotune.nodes.gains_place import (
     OwnGains,
@@ -565,4 +570,10 @@ def _not_in_force(name: str, error: RelayAutotuneError) -> TuningError:
 
 def main(args: list[str] | None = None) -> int:
     """Run controller_node."""
-    return run(ControllerNode, "controller_node", args, tables.CONTROLLER_PARAMETERS)
+    given = sys.argv[1:] if args is None else args
+    try:
+        words = with_gains_file(given)
+    except ParameterError as error:
+        sys.stderr.write(f"controller_node: {error}\n")
+        return 2
+    return run(ControllerNode, "controller_node", words, tables.CONTROLLER_PARAMETERS)

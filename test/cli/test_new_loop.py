@@ -27,9 +27,10 @@ from relay_autotune.cli.loops import Loop, TopicLoop
 from relay_autotune.cli.own_nodes import OwnNodes, namespace_of_joint, ros_arguments
 from relay_autotune.cli.settings import Kind, kind_of, with_flags
 from relay_autotune.cli.terminal import agrees, asked_for_file, number_of, pair_of
-from relay_autotune.errors import LoopError, SelectionError
-from relay_autotune.exchange.export import EXPORTS
+from relay_autotune.errors import LoopError, ParameterError, SelectionError
+from relay_autotune.exchange.export import EXPORTS, Target, exported
 from relay_autotune.exchange.messages import fill_gains
+from relay_autotune.nodes.gains_file import with_gains_file
 from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS
@@ -448,22 +449,55 @@ def test_somebody_without_a_controller_is_told_how_to_start_one(
     }
     # With a recording its folder keeps them, and the command is short.
     short = shown(None, "", "").partition("NEXT control with these gains ")[2].split()
-    topics, file = short[-6:-2], Path(short[-1])
-    assert short[-7:-6] == ["--ros-args"] and short[-2] == "--params-file"
-    assert topics == [
-        *("-r", "measurement:=/tank/level", "-r", "controller_command:=/tank/valve")
-    ]  # fmt: skip
-    (section,) = yaml.safe_load(file.read_text()).values()
-    kept = section["ros__parameters"]
-    of_file = {name: str(value) for name, value in kept.items()}
+    assert short[-3:-1] == ["controller_node", "--gains"]
+    own, topics = yaml.safe_load(Path(short[-1]).read_text()).values()
+    of_file = {name: str(value) for name, value in own["ros__parameters"].items()}
     assert of_file == {n: v for n, v in given.items() if n in of_file}
     assert set(given) - set(of_file) == {"measurement", "controller_command"}
+    assert topics["ros__parameters"] == {n: given[n] for n in topics["ros__parameters"]}
+    words = with_gains_file(["--gains", short[-1], "--ros-args", "-p", "kc:=1.0"])
+    assert words[:3] == ["--ros-args", "-p", "kc:=1.0"]
+    assert words[3:] == [
+        *("--ros-args", "--params-file", short[-1], "-r", "measurement:=/tank/level"),
+        *("-r", "controller_command:=/tank/valve"),
+    ]
     # For another type relay_node stands between controller and actuator.
     both = shown(None, "", "", command_type="std_msgs/msg/Float32").partition("NEXT ")[2]
     assert "controller_command:=" not in both
     assert both.endswith(
         "relay_node --ros-args -r command:=/tank/valve -p baseline:=35.0 -p initial_command:=35.0"
     )
+
+
+@pytest.mark.parametrize("text", ["- kc: 1", "{kc: ", None])
+def test_a_file_of_gains_that_is_none_is_refused(text: str | None, tmp_path: Path) -> None:
+    file = tmp_path / "gains.yaml"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(ParameterError, match=r"--gains .*(expected|cannot be read)"):
+        with_gains_file(["--gains", str(file)])
+
+
+def test_a_launch_file_starts_the_controller_with_limits_and_topics() -> None:
+    gains = design(
+        DesignTask(model=TransferFunction.fopdt(1.65, 1.0, 0.5), options=DesignOptions()), "imc"
+    )
+    target = Target(command_min=0.0, present=35.0, topics={"measurement": "/tank/level"})
+    made: dict[str, Any] = {}
+    launch: Any = SimpleNamespace(LaunchDescription=lambda nodes: nodes[0])
+    ros: Any = SimpleNamespace(Node=lambda **given: given)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "launch", launch)
+        patch.setitem(sys.modules, "launch_ros", SimpleNamespace(actions=ros))
+        patch.setitem(sys.modules, "launch_ros.actions", ros)
+        exec(exported(gains, "launch", target), made)
+        node = made["generate_launch_description"]()
+    assert (node["package"], node["executable"]) == ("relay_autotune", "controller_node")
+    (values,) = node["parameters"]
+    assert values["kc"] == pytest.approx(gains.kc) and values["initial_command"] == 35.0
+    assert "command_min" in values and "command_max" not in values
+    assert node["remappings"] == [("measurement", "/tank/level")]
+    assert set(values) <= {each.name for each in CONTROLLER_PARAMETERS}
 
 
 @pytest.mark.parametrize(
