@@ -19,7 +19,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from relay_autotune.cli.apply_gains import found_entries
+from relay_autotune.cli.apply_gains import beside, found_entries
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, as_typed, exit_status, say
 from relay_autotune.cli.loops import PATIENCE, Loop, Steps
 from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN, ranges, ros_arguments
@@ -52,7 +52,7 @@ from relay_autotune.exchange.export import (
     exports_of,
     node_parameters,
 )
-from relay_autotune.exchange.messages import gains_from_message
+from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
 from relay_autotune.loop.gains import Gains
 from relay_autotune.nodes.lifetime import NODE_FAILED
 from relay_autotune.nodes.live_types import FLOAT64
@@ -126,6 +126,7 @@ class AfterTune:
             left = "" if result.outcome == result.COMPLETED else self.loop.left()
             lines = result_lines(result, client.cancelled, paint, width(), left)
             print("\n".join(lines), flush=True)
+            self._compare()
         flags, report = self._reported()
         # Gains of nodes that end with this command cannot be asked for later.
         controllers = [] if self.loop.has_own_nodes else client.controllers()
@@ -146,6 +147,15 @@ class AfterTune:
         written = report or not options.report
         found = client.succeeded and complete and written and proven is not False
         return exit_status(found=found, doubtful=result.verdict == Verdict.DOUBTFUL)
+
+    def _compare(self) -> None:
+        """Show the gains in force beside the new ones, if a controller of the loop has some."""
+        result, loop = self.result, self.loop
+        if loop.has_own_nodes or not result.gains.experiment_id:
+            return
+        if (present := loop.present()) is not None:
+            model = transfer_function_from_message(result.transfer_function)
+            print("\n" + "\n".join(beside(present, self.gains, model)), flush=True)
 
     def _nothing_started(self) -> int:
         """Print the result of a dry run, or why the node refuses."""

@@ -439,8 +439,9 @@ PLATES = (
         draw_closed_loop,
         _without_gains,
         "A step of the set-point, then one of the load at the process input, on the identified "
-        "model and on some of those within its uncertainty. Good: one small overshoot and a quick "
-        "return, on all of them. Bad: ringing, or a load error that lasts long.",
+        "model and on some of those within its uncertainty; dashed: with the gains before, where "
+        "they are known. Good: one small overshoot and a quick return, on all of them. Bad: "
+        "ringing, or a load error that lasts long.",
         lambda _: (4.6, 5.0),
     ),
     Plate(

@@ -9,7 +9,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from relay_autotune.loop.sampled import ClosedLoop, simulate_closed_loop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.report.case import Case, EstimatedQuantity, ModelCase, in_loop
+from relay_autotune.report.findings import performance_of
 from relay_autotune.report.style import (
     BLUE,
     GREEN,
@@ -34,7 +35,7 @@ from relay_autotune.report.style import (
     in_steps,
     legend,
 )
-from relay_autotune.tuning import Gains
+from relay_autotune.tuning import Controller, Gains
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -370,6 +371,11 @@ def draw_closed_loop(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
                 around.time, around.measurement, color=SKY, lw=1.0, alpha=0.8,
                 label="models within the uncertainty",
             )  # fmt: skip
+    before = simulated_before(case, model, half)
+    if before is not None:
+        dashed: Any = {"color": MUTED, "lw": 1.5, "ls": (0, (4, 2))}
+        above.plot(before.time, before.measurement, label="the gains before", **dashed)
+        below.plot(*in_steps(before.time, before.command), **dashed)
     if run is not None:
         above.plot(run.time, run.measurement, color=VERMILLION, lw=2.0, label="the model")
         below.plot(*in_steps(run.time, run.command), color=BLUE, lw=1.5)
@@ -387,9 +393,22 @@ def draw_closed_loop(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     # A loop that is unstable on an extreme model must not set the scale for all others.
     low, high = above.get_ylim()
     above.set_ylim(max(low, -1.0), min(high, 2.5))
-    if case.models_around:
+    if case.models_around or before is not None:
         legend(figure, columns=2)
     finish(figure)
+
+
+def simulated_before(case: Case, model: TransferFunction, half: float) -> ClosedLoop | None:
+    """Return both steps with the gains before; None: they are not known, or unstable.
+
+    :param case: the experiment.
+    :param model: the process, with all dead time of the loop.
+    :param half: as of `simulated`.
+    """
+    present = case.present
+    if present is None or performance_of(present, case) is None:
+        return None
+    return simulated(present, model, half)
 
 
 def draw_rules(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
@@ -472,7 +491,7 @@ def distinct_gains(case: Case) -> tuple[Gains, ...]:
     return tuple(found.values())
 
 
-def step_duration(gains: Gains, model: TransferFunction) -> float:
+def step_duration(gains: Controller, model: TransferFunction) -> float:
     """Return how long a step is shown [s]: until it has settled, with some margin.
 
     :param gains: of the loop.
@@ -483,7 +502,7 @@ def step_duration(gains: Gains, model: TransferFunction) -> float:
     return 2.5 * (2.0 * model.dead_time + max(slowest, gains.ti) + reset)
 
 
-def shown_load(gains: Gains, model: TransferFunction) -> float:
+def shown_load(gains: Controller, model: TransferFunction) -> float:
     """Return the step of the load that is shown after one of the set-point [u].
 
     It is about half of the command that the step of the set-point needs, in the other direction.
@@ -495,7 +514,7 @@ def shown_load(gains: Gains, model: TransferFunction) -> float:
 
 
 @functools.lru_cache(maxsize=64)
-def simulated(gains: Gains, model: TransferFunction, half: float) -> ClosedLoop | None:
+def simulated(gains: Controller, model: TransferFunction, half: float) -> ClosedLoop | None:
     """Return a step of the set-point and then one of the load; None: the gains cannot run.
 
     :param gains: with the law that they are for, if one was named.
@@ -503,7 +522,9 @@ def simulated(gains: Gains, model: TransferFunction, half: float) -> ClosedLoop 
     :param half: time of the step of the load, and until the end after it [s].
     """
     load = shown_load(gains, model)
-    law, period = LAWS.get(gains.law), gains.law_period
+    law, period = None, 0.0
+    if isinstance(gains, Gains):
+        law, period = LAWS.get(gains.law), gains.law_period
     if law is not None and 2.0 * half < _MOST_SAMPLES * period:
         held = replace(model, dead_time=max(model.dead_time - law.lag(period), 0.0))
         return simulate_closed_loop(

@@ -452,7 +452,7 @@ class _Socket(_Guarded, WebSocketHandler):
                 self.tell(wire.to_text({"of": number, "trade_off": known}))
             if subject.case.present != self._present.get(number):
                 self._present[number] = subject.case.present
-                rows = wire.of_present(subject.case)
+                rows = wire.of_present(subject)
                 self.tell(wire.to_text({"of": number, "present": rows}))
 
 

@@ -23,6 +23,7 @@ from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import Quantity, declared
 from relay_autotune.report.case import Case
+from relay_autotune.report.findings import performance_of
 from relay_autotune.report.frequency import (
     loop_frequencies,
     shown_load,
@@ -269,6 +270,14 @@ class PageModel:
             return None
         return _shaped(alone, asked, gains, NOT_JUDGED, self._scale(gains))
 
+    def before(self) -> Steps | None:
+        """Return both steps with the present gains; None: they are not known, or unstable."""
+        case, shaping = self.case, self.shaping
+        if case.present is None or shaping is None or performance_of(case.present, case) is None:
+            return None
+        model = shaping.task.in_loop(shaping.task.model)
+        return _steps(case.present, model, [], *self._scale(case.present))
+
     def case_with(self, shaped: DesignResult) -> Case:
         """Return the experiment with other recommended gains, as the report shows it.
 
@@ -302,7 +311,7 @@ class PageModel:
         design, gains = found
         return gains if asked == plain else judged(shaping.task, design)
 
-    def _scale(self, gains: Gains) -> tuple[float, float]:
+    def _scale(self, gains: Controller) -> tuple[float, float]:
         """Return duration and load of the steps, which stay the same while gains change."""
         if self._shown is None:
             assert self.shaping is not None
@@ -343,7 +352,11 @@ def _ms(k: int) -> float:
 
 
 def _steps(
-    gains: Gains, model: TransferFunction, around: list[TransferFunction], half: float, load: float
+    gains: Controller,
+    model: TransferFunction,
+    around: list[TransferFunction],
+    half: float,
+    load: float,
 ) -> Steps:
     duration = 2.0 * half
     setpoint, loaded = step_responses(gains, model, duration, _POINTS)

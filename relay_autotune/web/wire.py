@@ -91,7 +91,7 @@ def of_subject(subject: PageModel) -> dict[str, Any]:
         else [_estimate(e) for e in (*model.estimates, *model.ultimate)],
         "record": _record(case),
         "rules": [{"rule": g.rule, "ms": short(np.array([g.ms, g.iae_load]))} for g in case.gains],
-        "present": of_present(case),
+        "present": of_present(subject),
         "may_shape": subject.shaping is not None,
         "around": len(subject.shaping.task.models) if subject.shaping is not None else 0,
         "first": of_asked(subject.first),
@@ -135,14 +135,20 @@ def _knows_noise(options: DesignOptions) -> bool:
     return options.noise_std > 0.0 and options.amplitude > 0.0
 
 
-def of_present(case: Case) -> list[list[str]]:
-    """Return the present gains and what they do on the model: names, values and meanings.
+def of_present(subject: PageModel) -> dict[str, Any]:
+    """Return the present gains, and what they do on the model.
 
-    :param case: the experiment.
+    :param subject: the model.
+    :return: rows of names, values and meanings, and the responses to both steps, if there are any.
     """
+    case, before = subject.case, subject.before()
     if case.present is None or case.model is None:
-        return []
-    return [list(row) for row in told_of(case.present, performance_of(case.present, case))]
+        return {"rows": [], "steps": None}
+    rows = told_of(case.present, performance_of(case.present, case))
+    steps = None
+    if before is not None:
+        steps = [short(each) for each in (before.time, before.measurement, before.command)]
+    return {"rows": [list(row) for row in rows], "steps": steps}
 
 
 def of_asked(asked: DesignRequest) -> dict[str, Any]:

@@ -159,10 +159,29 @@ function gainsWords(s, between = ", ") {
 }
 
 function showBeside() {
-  const rows = subjects[chosen].present;
+  const { rows } = subjects[chosen].present;
   $("beside-box").hidden = !(rows.length && shaped);
   if (shaped) table($("beside"), rows.map(([name, now, meaning], k) => [name, now, shaped.beside[k], meaning]), ["", "", "", "text"]);
+  if (shaped) showSteps(shaped.steps);
   if (live) live.showForce();
+}
+
+// A step of the set-point and one of the load, behind it those of the present gains.
+function showSteps(t) {
+  const { steps } = subjects[chosen].present;
+  const before = (k) => (steps ? [{ x: steps[0], y: steps[k], kind: "before", name: k === 1 ? "the present gains" : "" }] : []);
+  const end = t.time[t.time.length - 1];
+  const load = [{ x: t.load_time, kind: "load" }];
+  const highest = Math.max(...t.measurement.filter((v) => v !== null));
+  plots.measurement.draw({
+    xs: [0, end],
+    ys: [Math.max(-1, Math.min(-0.1, ...t.measurement)), Math.min(2.5, Math.max(1.6, 1.1 * highest))],
+    bands: [{ x: t.time, low: t.low, high: t.high, kind: "", name: "95 % of the models" }].filter((b) => b.low.length),
+    curves: [...before(1), { x: t.time, y: t.measurement, kind: "model", name: "the model" }],
+    lines: [...load, { y: 1, kind: "setpoint" }],
+    said: `highest ${highest.toFixed(2)} after a set-point step of 1`,
+  });
+  plots.command.draw({ xs: [0, end], curves: [...before(2), { x: t.time, y: t.command, kind: "input" }], lines: load });
 }
 
 // s: gains and what they do; of a sketch the exact ones follow, with their verdict
@@ -185,19 +204,7 @@ function showShaped(s, sketched) {
   for (const text of s.warnings) put($("warnings"), "li", text);
   $("weight-value").textContent = s.b.toFixed(2);
   if (asked.setpoint_weight === null) $("weight").value = s.b;
-  const t = s.steps;
-  const end = t.time[t.time.length - 1];
-  const load = [{ x: t.load_time, kind: "load" }];
-  const highest = Math.max(...t.measurement.filter((v) => v !== null));
-  plots.measurement.draw({
-    xs: [0, end],
-    ys: [Math.max(-1, Math.min(-0.1, ...t.measurement)), Math.min(2.5, Math.max(1.6, 1.1 * highest))],
-    bands: [{ x: t.time, low: t.low, high: t.high, kind: "", name: "95 % of the models" }].filter((b) => b.low.length),
-    curves: [{ x: t.time, y: t.measurement, kind: "model", name: "the model" }],
-    lines: [...load, { y: 1, kind: "setpoint" }],
-    said: `highest ${highest.toFixed(2)} after a set-point step of 1`,
-  });
-  plots.command.draw({ xs: [0, end], curves: [{ x: t.time, y: t.command, kind: "input" }], lines: load });
+  showSteps(s.steps);
   const circle = { x: [], y: [], kind: "limit", name: `Ms ${s.ms.toFixed(2)}` };
   for (let k = 0; k <= 90; k += 1) {
     circle.x.push(-1 + Math.cos((k * Math.PI) / 45) / s.ms);
