@@ -34,15 +34,10 @@ from relay_autotune.identification.limit_cycle.shape import (
     shape_of_record,
 )
 from relay_autotune.identification.methods import identify
+from relay_autotune.identification.methods.first_order import flat_fopdt, fopdt
 from relay_autotune.identification.methods.lags import equal
 from relay_autotune.identification.methods.square_wave import EXACT, FIRST
-from relay_autotune.identification.methods.thyagarajan2003 import (
-    HIGHER_ORDER,
-    SMALL_DEAD_TIME,
-    flat_fopdt,
-    fopdt,
-    unstable_fopdt,
-)
+from relay_autotune.identification.methods.thyagarajan import HIGHER_ORDER, SMALL_DEAD_TIME
 from relay_autotune.process.simulation import HalfCycle, RelayRun, simulate_relay
 from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
@@ -100,7 +95,7 @@ def fopdt_of(shape: Shape, level: float = 0.0) -> TransferFunction:
     try:
         return TransferFunction.fopdt(*fopdt(*numbers))
     except RelayAutotuneError:
-        return UNSTABLE_FOPDT.build(unstable_fopdt(*numbers))
+        return UNSTABLE_FOPDT.build(fopdt(*numbers, unstable=True))
 
 
 def flat_of(shape: Shape, level: float | None = None) -> TransferFunction:
@@ -122,7 +117,7 @@ def five_lags_of(shape: Shape, level: float | None = None) -> TransferFunction:
 def _equal_lags_of(
     order: int, shape: Shape, level: float | None, ratio: float
 ) -> TransferFunction:
-    cycle = SymmetricCycle(shape.period, shape.amplitude, 1.0, 0.0, 0.0, level or 0.0)
+    cycle = SymmetricCycle(shape.period, shape.amplitude, 1.0, level or 0.0, 0.0)
     gain, tau = equal(order, cycle, wave=FIRST if level is None else EXACT, ratio=ratio)
     return TransferFunction.lag_n(gain, tau, order, ratio * tau)
 

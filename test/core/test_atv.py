@@ -17,7 +17,7 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.methods import identify
-from relay_autotune.identification.methods.atv import (
+from relay_autotune.identification.methods.chang import (
     atv_from_numbers,
     identify_atv,
     ultimate_estimate,
@@ -150,7 +150,7 @@ def test_numbers_that_cannot_be_are_refused():
     with pytest.raises(IdentificationError, match="gain given is too small"):
         with_amplitude((1.0,), 10.0, 1.3, FIRST)
     for model in (MODEL_4, MODEL_5):
-        with pytest.raises(IdentificationError, match=r"less lag than .* model 1"):
+        with pytest.raises(IdentificationError, match="less lag than fopdt"):
             solutions(model, at(4.0), 2.0, FIRST)
     with pytest.raises(IdentificationError, match="needs the gain"):
         atv_from_numbers(SymmetricCycle(10.0, 1.0, 1.0, 0.0, 1.0), Known(structure="sopdt"))

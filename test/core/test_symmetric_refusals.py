@@ -18,8 +18,11 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.methods import identify
-from relay_autotune.identification.methods.atv import atv_from_numbers
-from relay_autotune.identification.methods.chang import chang_from_numbers, identify_chang
+from relay_autotune.identification.methods.chang import (
+    atv_from_numbers,
+    chang_from_numbers,
+    identify_chang,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 

@@ -18,15 +18,16 @@ from worked_cases import cases
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.limit_cycle.shape import shape_of_half_cycle
-from relay_autotune.identification.methods.lags import equal
-from relay_autotune.identification.methods.square_wave import EXACT, FIRST, Wave
-from relay_autotune.identification.methods.thyagarajan2003 import (
-    dead_time_ratio,
+from relay_autotune.identification.methods.first_order import (
     flat_fopdt,
     fopdt,
-    order_from_curvature,
     rise_time_constant,
-    unstable_fopdt,
+)
+from relay_autotune.identification.methods.lags import equal
+from relay_autotune.identification.methods.square_wave import EXACT, FIRST, Wave
+from relay_autotune.identification.methods.thyagarajan import (
+    dead_time_ratio,
+    order_from_curvature,
 )
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.structures import UNSTABLE_FOPDT
@@ -38,7 +39,7 @@ def equal_lags(
     order, period, amplitude, relay, level=0.0, *, wave: Wave = EXACT, ratio=0.0, dead_time=0.0
 ):
     """Return (K, tau, D) of equal lags."""
-    cycle = SymmetricCycle(period, amplitude, relay, 0.0, dead_time, level)
+    cycle = SymmetricCycle(period, amplitude, relay, level, dead_time)
     gain, tau = equal(order, cycle, wave=wave, ratio=ratio)
     return gain, tau, dead_time + ratio * tau
 
@@ -58,9 +59,9 @@ def test_the_equivalent_models_of_table_2(name, inputs, exact, tol):
     if exact["unstable"] is None:
         assert fopdt(*numbers) == pytest.approx(exact["1a"], rel=tol)
         with pytest.raises(IdentificationError, match="eq 16"):
-            unstable_fopdt(*numbers)
+            fopdt(*numbers, unstable=True)
     else:
-        assert unstable_fopdt(*numbers) == pytest.approx(exact["unstable"], rel=tol)
+        assert fopdt(*numbers, unstable=True) == pytest.approx(exact["unstable"], rel=tol)
         with pytest.raises(IdentificationError, match="eq 10"):
             fopdt(*numbers)
     # An ideal relay switches where y passes zero.
@@ -104,7 +105,7 @@ def test_the_unstable_process(name, inputs, exact, tol):
     p = inputs
     found = unstable_limit_cycle(p["K"], p["tau"], p["D"], p["h"])
     assert found == pytest.approx((exact["P"], exact["a"]), rel=tol)
-    back = unstable_fopdt(exact["P"], exact["a"], p["D"], p["h"])
+    back = fopdt(exact["P"], exact["a"], p["D"], p["h"], unstable=True)
     assert back == pytest.approx((p["K"], p["tau"], p["D"]), rel=1e-7)
 
 
@@ -138,7 +139,8 @@ def test_a_fopdt_process_with_hysteresis(relay, dead_time):
 @pytest.mark.parametrize("dead_time", [0.1, 0.3])
 def test_an_unstable_fopdt_process_with_hysteresis(relay, dead_time):
     s = reading(UNSTABLE_FOPDT.build((1.5, 1.0, dead_time)), relay)
-    found = unstable_fopdt(s.period, s.amplitude, s.time_to_peak, 2.0, relay.hysteresis)
+    numbers = (s.period, s.amplitude, s.time_to_peak, 2.0, relay.hysteresis)
+    found = fopdt(*numbers, unstable=True)
     assert found == pytest.approx((1.5, 1.0, dead_time), rel=1e-8)
     forward = unstable_limit_cycle(1.5, 1.0, dead_time, 2.0, relay.hysteresis)
     assert forward == pytest.approx((s.period, s.amplitude), rel=1e-9)

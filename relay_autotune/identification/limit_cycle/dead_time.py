@@ -13,15 +13,14 @@ import numpy as np
 from relay_autotune.errors import IdentificationError
 from relay_autotune.experiment.settling import ResponseDetector, RestState
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.limit_cycle.fold import Fold, fold
-from relay_autotune.identification.limit_cycle.limit_cycle import CycleRun, RelayTest
+from relay_autotune.identification.limit_cycle.fold import Fold, Reading, fold
+from relay_autotune.identification.limit_cycle.limit_cycle import RelayTest
 from relay_autotune.record.record import Record, RelaySettings
 
 # Least jump of the rate at a sharp edge, relative to its largest value: that of one lag jumps by
 # more than 1 where the command arrives.
 _JUMP = 0.6
 _BESIDE = 0.01
-_MOST_SINGLES = 8
 
 
 @dataclass(frozen=True)
@@ -38,31 +37,32 @@ class DeadTime:
     source: str = ""
 
 
-def read_dead_time(test: RelayTest, record: Record, known: Known, *, noisy: bool) -> DeadTime:
+def read_dead_time(test: RelayTest, known: Known) -> DeadTime:
     """Return the dead time that is known, or read it from the record.
 
     One lag turns at once when the command arrives, so that the measurement has an edge there in
     each half cycle. If the averaged half cycles have one, its time is taken, otherwise the time
     from the first kick to the first sample outside the noise.
 
-    :param test: the relay test.
-    :param record: the whole record, with the samples before the kick.
+    :param test: the relay test, with the samples before the kick.
     :param known: a known dead time.
-    :param noisy: True if noise matters.
     :raises IdentificationError: if it is not known and the record does not show it.
     """
     if not math.isnan(known.dead_time):
         return DeadTime(known.dead_time)
-    settings = test.whole.settings
-    edge, sharp = _edge(test.whole)
-    if sharp:
-        value = max(edge - settings.extra_delay, 0.0)
+    settings, cycles = test.settings, test.cycle.cycles
+    if _is_sharp(fold(test.whole, cycles)):
+        edge = Reading.of(test.whole, cycles, lambda seen: np.array([seen.edge]))
+        value = max(float(edge.values[0]) - settings.extra_delay, 0.0)
         source = (
             f"the dead time of {value:.4g} s was read as the time from the switch to the sharp "
             "peak; give it where it is known better, since these equations are sensitive to it"
         )
-        return DeadTime(value, _scatter_of_edge(test, noisy), source)
-    first, interval = _first_response(record, settings)
+        # An edge lies between two samples, whatever the cycles agree on.
+        between = test.record.interval / math.sqrt(12.0 * len(cycles))
+        scatter = float(np.nan_to_num(edge.std[0]))
+        return DeadTime(value, max(scatter, between), source)
+    first, interval = _first_response(test.whole, settings)
     if math.isnan(first):
         raise IdentificationError(
             "the dead time is not known, and neither sharp peaks nor a first kick from rest show "
@@ -76,38 +76,14 @@ def read_dead_time(test: RelayTest, record: Record, known: Known, *, noisy: bool
     return DeadTime(value, interval / math.sqrt(12.0), source)
 
 
-def _edge(stretch: CycleRun) -> tuple[float, bool]:
-    """Return the time from a switch to the edge after it, and whether it is sharp."""
-    try:
-        curve = fold(stretch.record, tuple(range(len(stretch.record.cycle_start) - 1)))
-    except IdentificationError:
-        return math.nan, False
-    if math.isnan(curve.edge):
-        return math.nan, False
-    return curve.edge, _is_sharp(curve)
-
-
 def _is_sharp(curve: Fold) -> bool:
+    if math.isnan(curve.edge):
+        return False
     beside = _BESIDE * 0.5 * curve.period
     before, after = curve.slope(np.array((curve.edge - beside, curve.edge + beside)))
     # Away from the edges, where a spline in noise has its largest rates.
     steepest = np.abs(curve.slope(np.linspace(0.0, curve.period, 101)))
     return bool(abs(after - before) > _JUMP * float(np.percentile(steepest, 90.0)))
-
-
-def _scatter_of_edge(test: RelayTest, noisy: bool) -> float:
-    """Return the standard deviation of the edge [s].
-
-    In noise it is the scatter of single cycles; without, the edge is between two samples.
-    """
-    if not noisy:
-        return test.whole.record.interval / math.sqrt(12.0 * len(test.whole.cycle.cycles))
-    stride = -(-len(test.singles) // _MOST_SINGLES)
-    edges = np.array([_edge(single)[0] for single in test.singles[::stride]])
-    edges = edges[np.isfinite(edges)]
-    if edges.size < 2:
-        return 0.0
-    return float(np.std(edges, ddof=1)) / math.sqrt(len(test.whole.cycle.cycles))
 
 
 def _first_response(record: Record, settings: RelaySettings) -> tuple[float, float]:

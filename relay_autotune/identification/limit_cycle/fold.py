@@ -25,6 +25,7 @@ from scipy.linalg import cho_factor
 from scipy.linalg.lapack import dpotrs
 from scipy.optimize import minimize_scalar
 from scipy.sparse import csr_array
+from scipy.special import stdtrit
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
@@ -261,6 +262,8 @@ class Fold:
     :param samples: number of samples laid over one another.
     :param mirrored: True if each half is the other one upside down, up to an offset.
     :param coefficients: of the spline's functions, of those of the kinks, and the offset [y].
+    :param lowest: of all samples, about the set-point [y].
+    :param highest: of all samples, about the set-point [y].
     """
 
     period_high: float
@@ -271,6 +274,8 @@ class Fold:
     samples: int
     mirrored: bool
     coefficients: FloatArray
+    lowest: float
+    highest: float
 
     @property
     def period(self) -> float:
@@ -308,19 +313,29 @@ class Fold:
         """Return the lowest and the highest measurement about the set-point [y].
 
         Noise makes a smooth maximum beside a kink too high; so the kink counts where it is the
-        peak within the uncertainty of the curve.
+        peak within the uncertainty of the curve. No peak lies beyond all samples.
         """
         y = self(np.linspace(0.0, self.period, _GRID))
-        ends = float(np.min(y)), float(np.max(y))
+        ends = max(float(np.min(y)), self.lowest), min(float(np.max(y)), self.highest)
         if math.isnan(self.edge):
             return ends
         kinks = self(np.array([self.edge, self.period_high + self.edge]))
         allowed = _DEVIATIONS * self.curve_std + _SHARE * 0.5 * (ends[1] - ends[0])
-        low, high = float(np.min(kinks)), float(np.max(kinks))
+        low = max(float(np.min(kinks)), self.lowest)
+        high = min(float(np.max(kinks)), self.highest)
         return (
             low if low <= ends[0] + allowed else ends[0],
             high if high >= ends[1] - allowed else ends[1],
         )
+
+    def half(self, time: FloatArray) -> FloatArray:
+        """Return the deviation after the switch that turns the measurement down, of both halves.
+
+        :param time: since that switch, up to half a period [s], shape (n,).
+        :return: mean of one half and of the other, turned over [y], shape (n,).
+        """
+        down, up = self(time + self.period_high), self(time)
+        return 0.5 * (down - up) * (-1.0 if self.settings.reverse_acting else 1.0)
 
     def fundamental(self) -> complex:
         """Return G(j w) at the frequency of the limit cycle (Wang et al. 1997, eq 23) [y/u]."""
@@ -388,29 +403,70 @@ def fold_without(
 _LEAST_CYCLES, _MOST_PARTS = 3, 20
 
 
-def scatter_of_fold(
-    record: Record,
-    cycles: tuple[int, ...],
-    measure: Callable[[Fold], FloatArray],
-    *,
-    sharp: bool = False,
-) -> FloatArray | None:
-    """Return the covariance of what is measured on an average, by leaving out each cycle once.
+@dataclass(frozen=True)
+class Reading:
+    """Numbers of a limit cycle, with their scatter from cycle to cycle.
 
-    :param record: with whole cycles.
-    :param cycles: numbers of the cycles that are averaged.
-    :param measure: from an averaged period to numbers, shape (n,).
-    :param sharp: as for :func:`fold`.
-    :return: shape (n, n); None for fewer than three cycles.
-    :raises IdentificationError: if there are too few samples without one of them.
+    :param values: the numbers, shape (n,).
+    :param covariance: of these, shape (n, n); None: not estimated.
+    :param cycles: number of cycles that were averaged.
     """
-    count = len(cycles)
-    if count < _LEAST_CYCLES:
-        return None
-    left_out = cycles[:: -(-count // _MOST_PARTS)]
-    parts = np.array([measure(fold_without(record, cycles, c, sharp)) for c in left_out])
-    away = parts - np.mean(parts, axis=0)
-    return np.asarray(away.T @ away * (count - 1) / len(parts))
+
+    values: FloatArray
+    covariance: FloatArray | None = None
+    cycles: int = 1
+
+    @classmethod
+    def of(
+        cls,
+        record: Record,
+        cycles: tuple[int, ...],
+        measure: Callable[[Fold], FloatArray],
+        *,
+        sharp: bool = False,
+    ) -> Reading:
+        """Measure an averaged period; the scatter is that of leaving out each cycle once.
+
+        :param record: with whole cycles.
+        :param cycles: numbers of the cycles that are averaged; fewer than three have no scatter.
+        :param measure: from an averaged period to numbers, shape (n,).
+        :param sharp: as for :func:`fold`.
+        """
+        count = len(cycles)
+        values, covariance = measure(fold(record, cycles, sharp=sharp)), None
+        if count >= _LEAST_CYCLES:
+            left_out = cycles[:: -(-count // _MOST_PARTS)]
+            parts = np.array([measure(fold_without(record, cycles, c, sharp)) for c in left_out])
+            away = parts - np.mean(parts, axis=0)
+            covariance = np.asarray(away.T @ away * (count - 1) / len(parts))
+        return cls(values, covariance, count)
+
+    @property
+    def quantile(self) -> float:
+        """Half the width of a 95 % interval in standard deviations."""
+        return float(stdtrit(max(self.cycles - 1, 1), 0.975))
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations of the numbers, shape (n,); NaN: not estimated."""
+        if self.covariance is None:
+            return np.full(self.values.size, math.nan)
+        return np.sqrt(np.diag(self.covariance))
+
+    def with_number(self, i: int, value: float, std: float) -> Reading:
+        """Return the reading with a number that is known otherwise, independently of the others.
+
+        :param i: its place.
+        :param value: the number.
+        :param std: its standard deviation.
+        """
+        values, covariance = self.values.copy(), self.covariance
+        values[i] = value
+        if covariance is not None:
+            covariance = covariance.copy()
+            covariance[i], covariance[:, i] = 0.0, 0.0
+            covariance[i, i] = std**2
+        return Reading(values, covariance, self.cycles)
 
 
 @cached_on_record
@@ -520,7 +576,7 @@ def _smoothed(
     like: Fold | None,
     sharp: bool,
 ) -> Fold:
-    if y.size < _SAMPLES_PER_KNOT * 2 * _KNOTS[0]:
+    if like is None and y.size < _SAMPLES_PER_KNOT * 2 * _KNOTS[0]:
         raise IdentificationError(
             f"the steady cycles hold {y.size} samples; their shape needs at least "
             f"{_SAMPLES_PER_KNOT * 2 * _KNOTS[0]:g}: sample faster, or let the relay run longer"
@@ -535,7 +591,10 @@ def _smoothed(
     def smoothed(spline: Spline, edge: float) -> Fold:
         coefficients, cost = spline.fitted(edge)
         scatter = math.sqrt(cost / max(n - coefficients.size, 1))
-        return Fold(high, low, settings, edge * unit, scatter, y.size, mirrored, coefficients)
+        return Fold(
+            *(high, low, settings, edge * unit, scatter, y.size, mirrored, coefficients),
+            *(float(np.min(y)), float(np.max(y))),
+        )
 
     if like is not None:
         spline, edge = Spline(basis, like.knots, x, value, weight), like.edge / unit

@@ -15,7 +15,7 @@ import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.limit_cycle.limit_cycle import CycleRun, RelayTest
+from relay_autotune.identification.limit_cycle.limit_cycle import RelayTest
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import result_field
@@ -95,13 +95,14 @@ def _polygon(angle: FloatArray) -> tuple[ComplexArray, ComplexArray]:
     return level, 0.5 * level - 1j * odd * middle
 
 
-def cycle_window(record: Record, first: int = 0) -> tuple[float, float, int]:
-    """Return start, end and number of the whole cycles of a record.
+def cycle_ends(record: Record, first: int = 0) -> FloatArray:
+    """Return when the whole cycles of a record begin, and when the last one ends [s].
 
-    The ends are the instants at which the command switched, not the samples beside them.
+    These are the instants at which the command switched, not the samples beside them.
 
     :param record: with at least one whole cycle after ``first``.
     :param first: cycles left out at the beginning.
+    :return: shape (cycles + 1,).
     :raises IdentificationError: if no whole cycle is left.
     """
     bounds = record.cycle_start[first:]
@@ -110,13 +111,9 @@ def cycle_window(record: Record, first: int = 0) -> tuple[float, float, int]:
             f"the record holds {max(len(record.cycle_start) - 1, 0)} whole cycles, of which "
             f"{first} are left out; at least one is needed: let the relay switch longer"
         )
-    u = record.input()
-
-    def switch_at(sample: int) -> float:
-        at = int(np.argmin(np.abs(u.times - record.time[sample])))
-        return min(float(u.times[at]), float(record.time[-1]))
-
-    return switch_at(bounds[0]), switch_at(bounds[-1]), len(bounds) - 1
+    switches = record.input().times
+    nearest = [switches[np.argmin(np.abs(switches - record.time[b]))] for b in bounds]
+    return np.minimum(nearest, record.time[-1])
 
 
 def frequency_point(record: Record, harmonic: int = 1, first: int = 0) -> FrequencyPoint:
@@ -130,7 +127,9 @@ def frequency_point(record: Record, harmonic: int = 1, first: int = 0) -> Freque
     :param first: cycles left out at the beginning, while the limit cycle settles.
     :raises IdentificationError: if no whole cycle is left or the command lacks the harmonic.
     """
-    start, end, w = _window_of_harmonic(record, harmonic, first)
+    ends = cycle_ends(record, first)
+    start, end = float(ends[0]), float(ends[-1])
+    w = harmonic * 2.0 * math.pi * (ends.size - 1) / (end - start)
     u = record.input()
     excited = fourier_integral_held(u, start, end, w)
     levels = np.append(u.values, u.initial)
@@ -142,28 +141,13 @@ def frequency_point(record: Record, harmonic: int = 1, first: int = 0) -> Freque
     return FrequencyPoint(w, answer / excited)
 
 
-def excitation(record: Record, harmonic: int = 1, first: int = 0) -> complex:
-    """Return the Fourier integral of the command that a point is divided by [u s].
+def cycle_means(record: Record, start: float, end: float) -> tuple[float, float]:
+    """Return the means of measurement [y] and command [u] between two instants.
 
-    :param record: as for :func:`frequency_point`, as are the next two.
+    :param record: the record.
+    :param start: begin of a cycle [s].
+    :param end: end of a cycle [s].
     """
-    start, end, w = _window_of_harmonic(record, harmonic, first)
-    return fourier_integral_held(record.input(), start, end, w)
-
-
-def _window_of_harmonic(record: Record, harmonic: int, first: int) -> tuple[float, float, float]:
-    start, end, cycles = cycle_window(record, first)
-    return start, end, harmonic * 2.0 * math.pi * cycles / (end - start)
-
-
-def cycle_means(record: Record, first: int = 0) -> tuple[float, float]:
-    """Return the means of measurement [y] and command [u] over whole cycles.
-
-    :param record: with whole cycles.
-    :param first: cycles left out at the beginning.
-    :raises IdentificationError: if no whole cycle is left.
-    """
-    start, end, _ = cycle_window(record, first)
     y = fourier_integral_sampled(record.time, record.measurement, start, end, 0.0).real
     u = fourier_integral_held(record.input(), start, end, 0.0).real
     return y / (end - start), u / (end - start)
@@ -171,6 +155,8 @@ def cycle_means(record: Record, first: int = 0) -> tuple[float, float]:
 
 _LEAST_BIAS = 0.02
 _LEAST_SAMPLES = 8
+# Least number of cycles that have a scatter, and number that gives it within 10 %.
+_LEAST_CYCLES, _MOST_SINGLES = 3, 60
 
 UNKNOWN_REST = (
     "no samples at rest before the test: the set-point stands in for the steady state, and the "
@@ -241,22 +227,27 @@ def static_gain(test: RelayTest, rest: SteadyState) -> StaticGain:
     :raises IdentificationError: if the mean command is the baseline: the relay was unbiased, or
         the process integrates.
     """
+    record, settings = test.record, test.settings
 
-    def ratio(part: CycleRun) -> FloatArray:
-        mean_y, mean_u = cycle_means(part.record)
-        away = mean_u - part.settings.baseline
-        if abs(away) < _LEAST_BIAS * part.settings.amplitude:
-            raise IdentificationError(
-                f"the mean command is only {away:g} away from the baseline, so that its ratio to "
-                "the measurement (eq 6) tells no gain: use a biased relay, or the method "
-                "wang_unbiased; an integrating process always has a mean of zero"
-            )
-        return np.array(((mean_y - rest.value) / away, away))
+    def ratio(start: float, end: float) -> tuple[float, float]:
+        mean_y, mean_u = cycle_means(record, start, end)
+        away = mean_u - settings.baseline
+        return (mean_y - rest.value) / away if away else math.inf, away
 
-    value, excursion = ratio(test.whole)
-    covariance, _ = test.scatter(ratio)
-    spread = math.nan if covariance is None else math.sqrt(covariance[0, 0])
-    return StaticGain(float(value), spread, float(excursion))
+    ends = cycle_ends(record)
+    value, excursion = ratio(float(ends[0]), float(ends[-1]))
+    if abs(excursion) < _LEAST_BIAS * settings.amplitude:
+        raise IdentificationError(
+            f"the mean command is only {excursion:g} away from the baseline, so that its ratio to "
+            "the measurement (eq 6) tells no gain: use a biased relay, or the method "
+            "wang_unbiased; an integrating process always has a mean of zero"
+        )
+    count = ends.size - 1
+    stride = -(-count // _MOST_SINGLES)
+    each = [ratio(*ends[i : i + 2].tolist())[0] for i in range(0, count, stride)]
+    known = len(each) >= _LEAST_CYCLES
+    scatter = float(np.std(each, ddof=1)) / math.sqrt(count) if known else math.nan
+    return StaticGain(value, scatter, excursion)
 
 
 Points = tuple[FrequencyPoint, ...]
@@ -270,22 +261,22 @@ _TOO_UNCERTAIN = 0.2
 _NEIGHBOURS = 6
 
 
-def measured_points(whole: CycleRun) -> Points:
+def measured_points(test: RelayTest) -> Points:
     """Return the points at the harmonics that the command of a relay test excites.
 
     Their standard deviations are those of white noise, and of straight lines between the samples.
     Harmonics that are uncertain by more than a fifth, or have too few samples, are left out.
 
-    :param whole: the cycles.
+    :param test: the relay test.
     :raises IdentificationError: if a cycle has too few samples, or the response at its own
         frequency drowns in noise.
     """
-    record = whole.record
+    record = test.record
     interval = record.interval
-    fundamental = 2.0 * math.pi / whole.cycle.period
+    fundamental = 2.0 * math.pi / test.cycle.period
     if fundamental * interval > _COARSEST:
         raise IdentificationError(
-            f"a cycle of {whole.cycle.period:g} s holds {whole.cycle.period / interval:.3g} "
+            f"a cycle of {test.cycle.period:g} s holds {test.cycle.period / interval:.3g} "
             f"samples; Fourier integrals need at least {2.0 * math.pi / _COARSEST:.0f}: sample "
             "faster, or use the method waveform"
         )
@@ -299,7 +290,7 @@ def measured_points(whole: CycleRun) -> Points:
         except IdentificationError:
             # The command of a symmetric relay holds nothing at the even ones.
             continue
-        point = replace(point, std=_deviation(point, interval, part / abs(_excited(whole, point))))
+        point = replace(point, std=_deviation(point, interval, part / abs(_excited(test, point))))
         if not point.std > _TOO_UNCERTAIN * abs(point.value):
             found.append(point)
         elif harmonic == 1:
@@ -312,7 +303,7 @@ def measured_points(whole: CycleRun) -> Points:
     return tuple(found)
 
 
-def with_noise_about(model: TransferFunction, whole: CycleRun, points: Points) -> Points:
+def with_noise_about(model: TransferFunction, test: RelayTest, points: Points) -> Points:
     """Return points with standard deviations from the residual of a model.
 
     Between the harmonics the residual's Fourier integrals show noise alone: neither the limit
@@ -320,13 +311,14 @@ def with_noise_about(model: TransferFunction, whole: CycleRun, points: Points) -
     harmonics, whatever its colour.
 
     :param model: near the points, without unstable poles.
-    :param whole: the cycles that they were measured in.
+    :param test: that they were measured in.
     :param points: from :func:`measured_points`.
     :return: those that are certain enough.
     :raises IdentificationError: if the point at the frequency of the limit cycle is not.
     """
-    record = whole.record
-    start, end, cycles = cycle_window(record)
+    record = test.record
+    ends = cycle_ends(record)
+    start, end, cycles = float(ends[0]), float(ends[-1]), ends.size - 1
     if cycles < 2:
         return points
     interval = record.interval
@@ -345,7 +337,7 @@ def with_noise_about(model: TransferFunction, whole: CycleRun, points: Points) -
             if each % cycles and each > 0
         ]
         part = math.sqrt(0.5 * float(np.mean(powers)))
-        deviation = _deviation(point, interval, part / abs(_excited(whole, point)))
+        deviation = _deviation(point, interval, part / abs(_excited(test, point)))
         if not deviation > _TOO_UNCERTAIN * abs(point.value):
             found.append(replace(point, std=deviation))
     if not found or found[0].frequency > points[0].frequency:
@@ -361,9 +353,10 @@ def _drowned(point: FrequencyPoint) -> IdentificationError:
     )
 
 
-def _excited(whole: CycleRun, point: FrequencyPoint) -> complex:
-    start, end, cycles = cycle_window(whole.record)
-    return excitation(whole.record, round(point.frequency * (end - start) / cycles / 2 / math.pi))
+def _excited(test: RelayTest, point: FrequencyPoint) -> complex:
+    ends = cycle_ends(test.record)
+    u = test.record.input()
+    return fourier_integral_held(u, float(ends[0]), float(ends[-1]), point.frequency)
 
 
 def _deviation(point: FrequencyPoint, interval: float, noise: float) -> float:

@@ -15,7 +15,7 @@ How its peaks grow from the first one tells, too.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
@@ -24,7 +24,7 @@ from scipy.special import fdtrc
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.limit_cycle.fold import Fold, fold, scatter_of_fold
+from relay_autotune.identification.limit_cycle.fold import Fold, Reading, fold
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.record.cycles import cycles_of, limit_cycle, settings_of
 from relay_autotune.record.record import Record, cached_on_record
@@ -347,48 +347,8 @@ def shape_of_half_cycle(cycle: HalfCycle) -> Shape:
     return shape_of_curve(cycle, cycle.half_period, growth)
 
 
-@dataclass(frozen=True)
-class Reading:
-    """The shape of a relay test with its uncertainty.
-
-    :param shape: the mean of its two halves.
-    :param names: the numbers of the shape in the covariance, in its order.
-    :param covariance: of these, by leaving out one cycle after the other, shape (n, n); None for
-        fewer than three cycles.
-    :param cycles: number of cycles that were averaged.
-    """
-
-    shape: Shape
-    names: tuple[str, ...]
-    covariance: FloatArray | None
-    cycles: int
-
-    @property
-    def features(self) -> FloatArray:
-        """The numbers of the shape in the covariance, shape (n,)."""
-        return np.array([getattr(self.shape, name) for name in self.names])
-
-    def at(self, features: FloatArray) -> Shape:
-        """Return the shape with other numbers."""
-        return replace(self.shape, **dict(zip(self.names, features.tolist(), strict=True)))
-
-    def given(self, name: str, value: float) -> Reading:
-        """Return the reading with a number that is known."""
-        covariance = self.covariance
-        if covariance is not None:
-            free = np.array([each != name for each in self.names])
-            covariance = covariance * np.outer(free, free)
-        return replace(self, shape=replace(self.shape, **{name: value}), covariance=covariance)
-
-    def std(self, name: str) -> float:
-        """Return the standard deviation of one number; NaN: not estimated."""
-        if self.covariance is None:
-            return math.nan
-        i = self.names.index(name)
-        return math.sqrt(float(self.covariance[i, i]))
-
-
-_VARYING = ("half_period", "amplitude", "level", "time_to_peak", "rise", "rise_half")
+# The numbers of a shape that vary from cycle to cycle.
+VARYING = ("half_period", "amplitude", "level", "time_to_peak", "rise", "rise_half")
 
 
 @cached_on_record
@@ -402,11 +362,12 @@ def shape_of_record(record: Record) -> Shape:
     return shape_of_fold(whole, _growth(record, whole.period))
 
 
-def read_shape(record: Record, *, sharp: bool = False) -> Reading:
-    """Return the shape of a relay test, and how certain it is.
+def read_shape(record: Record, *, sharp: bool = False) -> tuple[Shape, Reading]:
+    """Return the shape of a relay test, and how certain its numbers are.
 
     :param record: with at least one whole cycle.
     :param sharp: True if the peaks are known to be sharp, however much noise there is.
+    :return: the shape, and those of its numbers that are called ``VARYING``.
     :raises IdentificationError: if the record holds no whole cycle, or none about its set-point.
     """
     cycles = limit_cycle(record).cycles if cycles_of(record) else ()
@@ -414,10 +375,10 @@ def read_shape(record: Record, *, sharp: bool = False) -> Reading:
     shape = shape_of_fold(whole, _growth(record, whole.period))
 
     def numbers(part: Fold) -> FloatArray:
-        return Reading(shape_of_fold(part), _VARYING, None, 1).features
+        found = shape_of_fold(part)
+        return np.array([getattr(found, name) for name in VARYING])
 
-    covariance = scatter_of_fold(record, cycles, numbers, sharp=sharp)
-    return Reading(shape, _VARYING, covariance, len(cycles))
+    return shape, Reading.of(record, cycles, numbers, sharp=sharp)
 
 
 def _growth(record: Record, period: float) -> float:

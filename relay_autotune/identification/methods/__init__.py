@@ -9,12 +9,11 @@ from collections.abc import Callable, Sequence
 
 from relay_autotune.errors import IdentificationError, look_up
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.methods.atv import identify_atv
-from relay_autotune.identification.methods.chang import identify_chang
+from relay_autotune.identification.methods.chang import identify_atv, identify_chang
 from relay_autotune.identification.methods.fourier import identify_fourier
 from relay_autotune.identification.methods.li import identify_li, identify_li_jointly
 from relay_autotune.identification.methods.luyben import identify_step
-from relay_autotune.identification.methods.thyagarajan_method import identify_thyagarajan
+from relay_autotune.identification.methods.thyagarajan import identify_thyagarajan
 from relay_autotune.identification.methods.wang import identify_biased, identify_unbiased
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.method import (

@@ -30,13 +30,9 @@ from relay_autotune.identification.limit_cycle.fourier import (
     steady_state,
     with_noise_about,
 )
-from relay_autotune.identification.limit_cycle.limit_cycle import (
-    NOT_SETTLED,
-    RelayTest,
-    known_gain,
-    relay_test,
-)
+from relay_autotune.identification.limit_cycle.limit_cycle import RelayTest, relay_test
 from relay_autotune.identification.methods.fit import Fit
+from relay_autotune.identification.methods.solved import structure_asked_for
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.process.structures import (
     FOPDT,
@@ -146,8 +142,8 @@ _LAGS = (0.1, 0.5, 2.0, 10.0)
 _BEYOND = 1.3
 _STEP = 0.1
 
-# Structures beside equal lags: gain, at most one time constant, and dead time.
-_STRUCTURES = {s.name: s for s in (FOPDT, IPDT, INTEGRATOR_LAG, UNSTABLE_FOPDT)}
+# Gain, at most one time constant, and dead time.
+_STRUCTURES = (LAG_N, FOPDT, IPDT, INTEGRATOR_LAG, UNSTABLE_FOPDT)
 
 
 @dataclass(frozen=True)
@@ -184,24 +180,26 @@ def identify_fourier(record: Record, known: Known = NOTHING) -> Identification:
     :raises IdentificationError: if there is no whole cycle, too few samples in one, the points
         drown in noise, or the gain that is known has the wrong sign.
     """
-    structure = _structure_asked_for(known)
+    if known.structure == LAG_N.name:
+        known = replace(known, order=known.order or 2)
+    structure = structure_asked_for(METHOD, known, _STRUCTURES) or FOPDT
     test = relay_test(METHOD, record, two_levels=False)
-    sign = -1 if test.whole.settings.reverse_acting else 1
-    known_gain(known, sign)
-    harmonics = measured_points(test.whole)
+    sign = test.sign
+    test.known_gain(known)
+    harmonics = measured_points(test)
     points = _with_static_gain(test, record, harmonics, structure)
     fit = _fit(structure, known, sign, points)
     cost, x = _nearest(fit, points)
     if not structure.unstable:
-        harmonics = with_noise_about(structure.build(fit.values(x)), test.whole, harmonics)
+        harmonics = with_noise_about(structure.build(fit.values(x)), test, harmonics)
         points = _with_static_gain(test, record, harmonics, structure)
         fit = _fit(structure, known, sign, points)
         cost, x = fit.refined(x)
     values = fit.values(x)
-    remarks = [] if test.whole.cycle.converged else [NOT_SETTLED]
+    remarks = test.remarks(symmetric=False)
     freedom = points.numbers - fit.free.size
     # The standard deviations are estimates with few degrees of freedom.
-    told = max(4 * (len(test.whole.cycle.cycles) - 1), 1)
+    told = max(4 * (len(test.cycle.cycles) - 1), 1)
     unlikely = freedom > 0 and fdtrc(freedom, told, cost / freedom) < _UNLIKELY
     if unlikely:
         remarks.append(
@@ -244,7 +242,7 @@ def _with_static_gain(
     frequency = [p.frequency for p in points]
     value = [p.value for p in points]
     std = [p.std for p in points]
-    settings = test.whole.settings
+    settings = test.settings
     rest = steady_state(record, settings)
     if not structure.integrators and rest.measured:
         try:
@@ -257,17 +255,6 @@ def _with_static_gain(
             value.insert(0, complex(gain.value))
             std.insert(0, gain.std(rest))
     return _Points(np.array(frequency), np.array(value), np.array(std))
-
-
-def _structure_asked_for(known: Known) -> Structure:
-    if known.structure == LAG_N.name or (not known.structure and known.order > 1):
-        return LAG_N.of_order(known.order or 2)
-    name = known.structure or FOPDT.name
-    if name not in _STRUCTURES:
-        raise IdentificationError(
-            f"{METHOD} has no structure {name!r}; it has {LAG_N.name}, {', '.join(_STRUCTURES)}"
-        )
-    return _STRUCTURES[name]
 
 
 def _fit(structure: Structure, known: Known, sign: int, points: _Points) -> Fit:

@@ -28,7 +28,6 @@ from dataclasses import dataclass
 from scipy.optimize import brentq
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.known import Known
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.methods.square_wave import EXACT, FIRST, Wave
 from relay_autotune.process.structures import (
@@ -37,7 +36,6 @@ from relay_autotune.process.structures import (
     SOPDT,
     TWO_EQUAL_ONE,
     Structure,
-    equal_lags,
 )
 
 MODEL_1, MODEL_4, MODEL_5 = FOPDT, SOPDT, TWO_EQUAL_ONE
@@ -53,89 +51,31 @@ _NONE = 1e-12
 class _TwoConstants:
     """Models between two orders of equal lags, by the share of a lag in the attenuation.
 
-    :param text: the model.
     :param shares: from the parameter s to the share of each lag.
     :param ends: of the branches of s, each of which holds one solution at most.
     :param constants: places of the model's constants among the lags.
-    :param most: what has more lag than any such model.
-    :param instead: models with more lag.
     """
 
-    text: str
     shares: Callable[[float], tuple[float, ...]]
     ends: tuple[float, ...]
     constants: tuple[int, int]
-    most: str
-    instead: str
 
 
 # Between two equal lags and three there are two solutions, one with the larger constant repeated
 # and one with the smaller. Two equal lags are the end of the second branch, where the single one
 # vanishes.
 _TWO_CONSTANTS = {
-    MODEL_4: _TwoConstants(
-        *("model 4 (two lags)", lambda s: (1.0 - s, s), (_NONE, 0.5), (0, 1)),
-        *("two equal lags have", "model 3 or 5"),
-    ),
+    MODEL_4: _TwoConstants(lambda s: (1.0 - s, s), (_NONE, 0.5), (0, 1)),
     MODEL_5: _TwoConstants(
-        "model 5 (two equal lags and one)",
-        lambda s: (s, s, max(1.0 - 2.0 * s, 1e-13)),
-        *((_NONE, 1.0 / 3.0, 0.5), (1, 2), "three equal lags have", "more equal lags"),
+        lambda s: (s, s, max(1.0 - 2.0 * s, 1e-13)), (_NONE, 1.0 / 3.0, 0.5), (1, 2)
     ),
 }
+STRUCTURES = (FOPDT, LAG_N, MODEL_4, MODEL_5)
 
 
 def model_text(model: Structure) -> str:
-    """Return the name of a model, with the paper's number where it has one."""
-    if model in _TWO_CONSTANTS:
-        return _TWO_CONSTANTS[model].text
-    text = "one lag" if model.order == 1 else f"{model.order} equal lags"
-    return f"model {model.order} ({text})" if model.order <= 3 else text
-
-
-def constants_text(constants: Sequence[float]) -> str:
-    """Return time constants as text."""
-    if len(constants) == 1:
-        return f"tau = {constants[0]:.4g} s"
-    return ", ".join(f"tau{i} = {c:.4g} s" for i, c in enumerate(constants, 1))
-
-
-def lags_of(model: Structure, constants: Sequence[float]) -> tuple[float, ...]:
-    """Return the time constants of all lags [s].
-
-    :param model: one of the models.
-    :param constants: tau, or tau1 and tau2 [s].
-    """
-    given = dict(zip(model.parameters[1:-1], constants, strict=True))
-    return tuple(
-        given[p] for f in model.factors for p in f.parameters for _ in range(f.multiplicity)
-    )
-
-
-def model_asked_for(method: str, known: Known) -> Structure | None:
-    """Return the model that is known, or None where the choice is the method's.
-
-    :param method: its name, for the message.
-    :param known: a known structure, a known order.
-    :raises IdentificationError: if the method has no such model.
-    """
-    models = {model.name: model for model in (MODEL_1, MODEL_4, MODEL_5)}
-    model = models.get(known.structure)
-    if model is not None and known.order not in (0, model.order):
-        raise IdentificationError(
-            f"the structure {known.structure} has {model.order} lags, but the order given is "
-            f"{known.order}: leave one of the two out"
-        )
-    if model is None and known.structure not in ("", LAG_N.name):
-        raise IdentificationError(
-            f"{method} has no structure {known.structure!r}; it has fopdt, lag_n, sopdt and "
-            "two_equal_one"
-        )
-    if known.structure == LAG_N.name and not known.order:
-        raise IdentificationError(
-            "the structure lag_n needs its order, the number of equal lags: give it"
-        )
-    return model or (equal_lags(known.order) if known.order else None)
+    """Return the name of a model, with its order where it may have any."""
+    return f"{model.name} of order {model.order}" if model.any_order else model.name
 
 
 def solutions(
@@ -175,14 +115,11 @@ def solutions(
     low, middle, *more = row.ends
     too_little = above(lags(1.0)) <= 0.0
     if too_little or excess(middle) > 0.0:
-        what, instead = (
-            ("less lag than one lag has", "model 1")
-            if too_little
-            else (f"more lag than {row.most}", row.instead)
-        )
+        what = "less lag than fopdt" if too_little else f"more lag than {model.order} equal lags"
         raise IdentificationError(
-            f"no process of {row.text} has this period and amplitude: it has {what} at this gain "
-            f"and dead time; try {instead}, or check gain and dead time"
+            f"no process of the structure {model.name} has this period and amplitude: it has "
+            f"{what} at this gain and dead time; try another structure, or check gain and dead "
+            "time"
         )
     roots = [_root(excess, low, middle)]
     roots += [_root(excess, middle, high) for high in more if excess(high) > 0.0]

@@ -10,9 +10,9 @@ describing function
 
     G(j w) = -(pi a/4 h) exp(j (w Delta + asin(epsilon/a))),   w = 2 pi/P,
 
-with the hysteresis epsilon zero in the paper. A model is fitted to the points of all tests
-jointly. By default it is fitted to periods and amplitudes themselves, which a model of lags
-predicts exactly (Chang, Shen and Yu 1992, eqs 8 to 12 and 19 with a hysteresis).
+with the hysteresis epsilon zero in the paper, where a model is fitted to the points of all tests.
+Here it is fitted to periods and amplitudes themselves, which a model of lags predicts exactly
+(Chang, Shen and Yu 1992, eqs 8 to 12 and 19 with a hysteresis).
 """
 
 from __future__ import annotations
@@ -23,37 +23,37 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import stdtrit
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.limit_cycle.fold import Reading
 from relay_autotune.identification.limit_cycle.limit_cycle import (
-    NOT_SETTLED,
-    CycleReader,
     RelayTest,
     SymmetricCycle,
-    features,
     relay_test,
-    require_unbiased,
-    skew_warning,
+)
+from relay_autotune.identification.methods.chang import (
+    alike,
+    measured,
+    shape_misfit,
+    symmetric_cycle,
 )
 from relay_autotune.identification.methods.fit import Fit
 from relay_autotune.identification.methods.lags import (
     MODEL_1,
     MODEL_4,
     MODEL_5,
-    constants_text,
+    STRUCTURES,
     equal,
-    lags_of,
-    model_asked_for,
     model_text,
 )
+from relay_autotune.identification.methods.solved import literally, structure_asked_for
 from relay_autotune.identification.methods.square_wave import level, peak
-from relay_autotune.identification.methods.symmetric_method import alike, shape_misfit
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.process.structures import Structure, equal_lags
+from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Record
 
 METHOD = "li"
@@ -72,7 +72,6 @@ _LEAST_APART = 1e-3
 _LEAST_PERIOD_ERROR = 2e-4
 _LEAST_AMPLITUDE_ERROR = 1e-3
 _SHARE_OF_INTERVAL = 0.3
-_RAISED = 0.5
 
 
 @dataclass(frozen=True)
@@ -90,11 +89,6 @@ class JointFit:
     misfit: float
     covariance: FloatArray
 
-    @property
-    def solution(self) -> tuple[float, ...]:
-        """Size of the gain, and time constants."""
-        return abs(float(self.values[0])), *self.values[1:-1].tolist()
-
 
 def describing_function_point(cycle: SymmetricCycle) -> tuple[float, complex]:
     """Return (w, G(j w)) of the process, by the describing function.
@@ -102,7 +96,6 @@ def describing_function_point(cycle: SymmetricCycle) -> tuple[float, complex]:
     :param cycle: a limit cycle whose ``dead_time`` is what was added to the relay.
     :raises IdentificationError: if the hysteresis is not below the amplitude.
     """
-    cycle = replace(cycle, switch_level=math.nan)
     cycle.require_switching()
     size = math.pi * cycle.amplitude / (4.0 * cycle.relay)
     turn = cycle.frequency * cycle.dead_time + math.asin(cycle.level / cycle.amplitude)
@@ -219,11 +212,11 @@ def _of_cycle(
     model: Structure, values: FloatArray, test: SymmetricCycle, errors: tuple[float, float]
 ) -> tuple[float, float]:
     """Return how far period and amplitude are from the model's, to first order."""
-    gain, *constants, dead_time = np.abs(values).tolist()
-    lags = lags_of(model, constants)
+    process = model.build(np.abs(values))
+    gain, lags = process.gain, tuple(t.real for t in process.time_constants)
 
     def excess(period: float) -> float:
-        part = 1.0 - 2.0 * (dead_time + test.dead_time) / period
+        part = 1.0 - 2.0 * (process.dead_time + test.dead_time) / period
         return level(lags, period, max(part, 0.0)) - test.level / (gain * test.relay)
 
     # The level at the switch grows with the period that is given to a model.
@@ -287,31 +280,33 @@ def identify_li_jointly(records: Sequence[Record], known: Known = NOTHING) -> Id
         or no model agrees with them.
     """
     tests = [relay_test(METHOD, record) for record in records]
-    settings = [test.whole.settings for test in tests]
-    for each in settings:
-        require_unbiased(METHOD, each)
-    if len({each.reverse_acting for each in settings}) > 1:
+    for test in tests:
+        test.require_unbiased()
+    if len({test.sign for test in tests}) > 1:
         raise IdentificationError(
             "one of the tests had a reverse-acting relay and another did not: they are not of "
             "one process"
         )
-    cycles = [CycleReader.of(test.whole).read(test.whole, 0.0) for test in tests]
+    readings = [Reading.of(test.whole, test.cycle.cycles, measured) for test in tests]
+    cycles = [
+        symmetric_cycle(read.values, test.settings.amplitude, test.settings.extra_delay)
+        for test, read in zip(tests, readings, strict=True)
+    ]
     require_difference(cycles)
-    sign = -1 if settings[0].reverse_acting else 1
-    candidates = _fits(cycles, known, [_errors(test) for test in tests], sign)
+    errors = [_errors(test, read) for test, read in zip(tests, readings, strict=True)]
+    candidates = _fits(cycles, known, errors, tests[0].sign)
     away = [_shape_misfit(tests, cycles, candidate) for candidate in candidates]
     fit = next(c for c, a in zip(candidates, away, strict=True) if alike(a, min(away)))
-    degrees = sum(len(test.singles) - 1 for test in tests)
+    known_scatter = any(read.covariance is not None for read in readings)
     remarks = [
         f"test {number}: {remark}"
         for number, test in enumerate(tests, start=1)
-        for remark in (skew_warning(test.whole), "" if test.whole.cycle.converged else NOT_SETTLED)
-        if remark
+        for remark in test.remarks()
     ]
     return identified(
         METHOD,
-        Estimate.of(fit.model, fit.values, fit.covariance if degrees > 0 else None),
-        float(stdtrit(max(degrees, 1), 0.975)),
+        Estimate.of(fit.model, fit.values, fit.covariance if known_scatter else None),
+        Reading(fit.values, None, sum(r.cycles - 1 for r in readings) + 1).quantile,
         warnings=(*remarks, *_remarks(cycles, known, fit)),
     )
 
@@ -326,7 +321,7 @@ def li_from_numbers(cycles: Sequence[SymmetricCycle], known: Known) -> Identific
     """
     fit = _fits(cycles, known, (), 1)[0]
     estimate = Estimate.of(fit.model, fit.values)
-    return identified(METHOD, estimate, warnings=tuple(_remarks(cycles, known, fit)))
+    return identified(METHOD, estimate, NORMAL_95, warnings=tuple(_remarks(cycles, known, fit)))
 
 
 def _fits(
@@ -335,7 +330,7 @@ def _fits(
     errors: Sequence[tuple[float, float]],
     sign: int,
 ) -> list[JointFit]:
-    model = model_asked_for(METHOD, known)
+    model = structure_asked_for(METHOD, known, STRUCTURES)
     if model is None:
         return fits_jointly(cycles, known.dead_time, errors=errors, sign=sign)
     return [fit_jointly(model, cycles, known.dead_time, errors=errors, sign=sign)]
@@ -345,28 +340,19 @@ def _shape_misfit(
     tests: Sequence[RelayTest], cycles: Sequence[SymmetricCycle], fit: JointFit
 ) -> float:
     """Return how far the half cycles of all tests are from a model's, over their amplitudes."""
-    away = []
-    for test, cycle in zip(tests, cycles, strict=True):
-        delayed = replace(cycle, dead_time=float(fit.values[-1]) + cycle.dead_time)
-        misfit = shape_misfit(test.whole, fit.model, delayed, fit.solution)
-        away.append(misfit / cycle.amplitude)
-    return math.hypot(*away)
+    gain, *constants, dead_time = np.abs(fit.values).tolist()
+    delayed = [replace(cycle, dead_time=dead_time + cycle.dead_time) for cycle in cycles]
+    pairs = zip(tests, delayed, strict=True)
+    return math.hypot(*(shape_misfit(t, fit.model, c, (gain, *constants)) for t, c in pairs))
 
 
-def _errors(test: RelayTest) -> tuple[float, float]:
+def _errors(test: RelayTest, read: Reading) -> tuple[float, float]:
     """Return relative errors of the averaged period and amplitude."""
-    whole = test.whole
-    values = features(whole)
-    covariance, _ = test.scatter(features)
-    spread = np.zeros(2) if covariance is None else np.sqrt(np.diag(covariance))
-    period, amplitude = (spread / values).tolist()
-    # Noise makes every peak higher, which the scatter does not show.
-    noise = whole.record.noise_std
-    raised = _RAISED * noise / float(values[1]) if math.isfinite(noise) else 0.0
-    sampled = _SHARE_OF_INTERVAL * whole.record.interval / float(values[0])
+    period, amplitude = (np.nan_to_num(read.std[:2]) / read.values[:2]).tolist()
+    sampled = _SHARE_OF_INTERVAL * test.record.interval / float(read.values[0])
     return (
         max(period, sampled, _LEAST_PERIOD_ERROR),
-        max(amplitude, raised, _LEAST_AMPLITUDE_ERROR),
+        max(amplitude, _LEAST_AMPLITUDE_ERROR),
     )
 
 
@@ -381,13 +367,12 @@ def _remarks(cycles: Sequence[SymmetricCycle], known: Known, fit: JointFit) -> l
             f"by {fit.misfit:.2g} times their errors; the process is of another structure, or "
             "changed between the tests"
         )
-    try:
-        literal = fit_jointly(fit.model, cycles, known.dead_time, exact=False)
-    except IdentificationError:
-        return found
-    gain, *constants, dead_time = literal.values.tolist()
-    found.append(
-        f"by the describing function, as in the paper, the tests would give K = {gain:.4g}, "
-        f"{constants_text(constants)}, dead time {dead_time:.4g} s"
+    sign = 1 if fit.values[0] > 0.0 else -1
+    return found + literally(
+        "the equations of the describing function",
+        fit.model,
+        lambda: fit_jointly(
+            fit.model, cycles, known.dead_time, exact=False, sign=sign
+        ).values.tolist(),
+        fit.values,
     )
-    return found

@@ -31,6 +31,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate, carried
 from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.methods.solved import structure_asked_for
 from relay_autotune.identification.result import FitReport, Identification, identified
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import INTEGRATOR_INVERSE
@@ -158,7 +159,7 @@ def identify_step(record: Record, known: Known = NOTHING) -> Identification:
     :param known: a known dead time is not read from the record.
     :raises IdentificationError: if the record holds no such response.
     """
-    require_structure(known)
+    structure_asked_for(METHOD, known, (INTEGRATOR_INVERSE,))
     test = step_test(record)
     until = _return_time(test, record.noise_std)
     curve, covariance = _fitted(test, until, known.dead_time)
@@ -189,18 +190,6 @@ def identify_step(record: Record, known: Known = NOTHING) -> Identification:
         warnings=tuple(warnings),
         fitted=fitted,
     )
-
-
-def require_structure(known: Known) -> None:
-    """Refuse every structure but the one that the method has.
-
-    :param known: with the structure that is asked for.
-    :raises IdentificationError: if it is another one.
-    """
-    if known.structure not in ("", INTEGRATOR_INVERSE.name):
-        raise IdentificationError(
-            f"{METHOD} has no structure {known.structure!r}; it has {INTEGRATOR_INVERSE.name} only"
-        )
 
 
 def identify_step_numbers(
