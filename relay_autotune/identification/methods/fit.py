@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from relay_autotune.arrays import FloatArray
+from relay_autotune.identification.estimate import jacobian
 from relay_autotune.process.structures import Structure
 
 _NO_VALUE = 1e12
@@ -135,8 +136,8 @@ class Fit:
     def steps(self, x: FloatArray) -> FloatArray:
         """Return how the minimum moves with each measured number, by one standard deviation.
 
-        ``(J'J + sum_i r_i r_i'')^-1 J'`` with the residuals r and their derivatives J; a value at
-        an end of its range stays there.
+        ``(J'J)^-1 J'`` with the derivatives J of the errors; a value at an end of its range stays
+        there.
 
         :param x: where the sum of squares is least, shape (m,).
         :return: shape (n, m).
@@ -145,25 +146,16 @@ class Fit:
         # The largest dead time is a limit of the search, not of what the numbers allow.
         above = np.where(self._linear, np.inf, high - x)
         inside = np.flatnonzero(np.minimum(x - low, above) > _AT_END * self._scale)
-        room = np.where(self._linear, 0.5 * x, np.inf)
-        sides = np.diag(np.minimum(_DIFFERENCE * self._scale, room))[inside]
-        here = self._errors(x)
-        steps = np.zeros((here.size, x.size))
-        if inside.size == 0:
-            return steps
-        ahead = np.array([self._errors(x + h) - here for h in sides])
-        back = np.array([self._errors(x - h) - here for h in sides])
-        size = sides.max(axis=1)
-        jacobian = (ahead - back) / (2.0 * size[:, None])
-        hessian = jacobian @ jacobian.T
-        for i, a in enumerate(sides):
-            hessian[i, i] += here @ (ahead[i] + back[i]) / size[i] ** 2
-            for k in range(i):
-                both = self._errors(x + a + sides[k]) + self._errors(x - a - sides[k]) - 2.0 * here
-                mixed = both - ahead[i] - back[i] - ahead[k] - back[k]
-                hessian[i, k] += 0.5 * (here @ mixed) / (size[i] * size[k])
-                hessian[k, i] = hessian[i, k]
-        units = np.outer(self._scale[inside], self._scale[inside])
-        inverse = np.linalg.pinv(hessian * units, hermitian=True) * units
-        steps[:, inside] = jacobian.T @ inverse
+        size = np.minimum(_DIFFERENCE * self._scale, np.where(self._linear, 0.5 * x, np.inf))
+
+        def errors(part: FloatArray) -> FloatArray:
+            at = x.copy()
+            at[inside] = part
+            return self._errors(at)
+
+        steps = np.zeros((self._errors(x).size, x.size))
+        if inside.size:
+            scale = self._scale[inside]
+            steps[:, inside] = np.linalg.pinv(jacobian(errors, x[inside], size[inside]) * scale).T
+            steps[:, inside] *= scale
         return steps

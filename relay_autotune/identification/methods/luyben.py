@@ -21,18 +21,18 @@ r = (tau1 + tau2)/tau2 and z = t2/tau2 only one monotone equation has to be solv
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.estimate import Estimate, carried
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.methods.solved import structure_asked_for
-from relay_autotune.identification.result import FitReport, Identification, identified
+from relay_autotune.identification.limit_cycle.fold import Reading
+from relay_autotune.identification.methods.solved import solved, structure_asked_for
+from relay_autotune.identification.result import FitReport, Identification
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import INTEGRATOR_INVERSE
 from relay_autotune.record.record import PiecewiseConstant, Record
@@ -161,35 +161,34 @@ def identify_step(record: Record, known: Known = NOTHING) -> Identification:
     """
     structure_asked_for(METHOD, known, (INTEGRATOR_INVERSE,))
     test = step_test(record)
-    until = _return_time(test, record.noise_std)
-    curve, covariance = _fitted(test, until, known.dead_time)
-    values = _values(curve, test.step)
-    if covariance is not None:
-        end = curve.dead_time + curve.span
-
-        def of_curve(x: FloatArray) -> FloatArray:
-            dead_time = float(x[0])
-            return _values(StepCurve(dead_time, end - dead_time, x[1:]), test.step)
-
-        at = np.concatenate(([curve.dead_time], curve.coefficients))
-        covariance = carried(of_curve, at, covariance)
-    fit, fitted = _report(record, test, curve, values)
-    warnings = []
     noise = _noise(test, record.noise_std)
-    if fit.residual_rms > max(_UNEXPLAINED * noise, 1e-4 * float(np.ptp(test.y))):
-        warnings.append(
-            f"the model leaves {fit.residual_rms:.3g} rms of the step response unexplained, where "
-            f"the noise is {noise:.3g}: noise moved the few numbers that the method reads, the "
-            "process is of another structure, or it was not in balance before the step; the "
-            "method waveform uses all samples"
+    curve, covariance = _fitted(test, _return_time(test, noise), known.dead_time)
+    end = curve.dead_time + curve.span
+
+    def equations(numbers: FloatArray) -> Sequence[float]:
+        dead_time = float(numbers[0])
+        return _values(StepCurve(dead_time, end - dead_time, numbers[1:]), test.step)
+
+    numbers = np.concatenate(([curve.dead_time], curve.coefficients))
+    reading = Reading(numbers, covariance, test.y.size)
+    found = solved(METHOD, INTEGRATOR_INVERSE, equations, reading)
+    # The whole step response, as far as the command kept still.
+    u = PiecewiseConstant(np.array([test.begin]), np.array([test.step]), 0.0)
+    fitted = np.full(len(record), math.nan)
+    fitted[: test.time.size] = curve.coefficients[-1] + response(found.model, test.time, u)
+    left = float(np.sqrt(np.nanmean((record.measurement - fitted) ** 2)))
+    spread = float(np.std(test.y))
+    warnings = found.warnings
+    if left > max(_UNEXPLAINED * noise, 1e-4 * float(np.ptp(test.y))):
+        text = (
+            f"the model leaves {left:.3g} rms of the step response unexplained, where the noise "
+            f"is {noise:.3g}: noise moved the few numbers that the method reads, the process is "
+            "of another structure, or it was not in balance before the step; the method waveform "
+            "uses all samples"
         )
-    return identified(
-        METHOD,
-        Estimate.of(INTEGRATOR_INVERSE, values, covariance),
-        fit=fit,
-        warnings=tuple(warnings),
-        fitted=fitted,
-    )
+        warnings = (*warnings, text)
+    fit = FitReport(left, record.noise_std, 1.0 - left / spread if spread > 0.0 else math.nan)
+    return replace(found, fit=fit, warnings=warnings, fitted=fitted)
 
 
 def identify_step_numbers(
@@ -204,9 +203,12 @@ def identify_step_numbers(
     :param dead_time: D [s].
     :raises IdentificationError: if no such process has these numbers.
     """
-    gain, tau1, tau2 = from_step(t1, t2, extremum, step)
-    values = np.array((gain, tau1, tau2, dead_time))
-    return identified(METHOD, Estimate.of(INTEGRATOR_INVERSE, values))
+    numbers = Reading(np.array((t1, t2, extremum)))
+    return solved(
+        *(METHOD, INTEGRATOR_INVERSE),
+        lambda x: (*from_step(float(x[0]), float(x[1]), float(x[2]), step), dead_time),
+        numbers,
+    )
 
 
 def step_test(record: Record) -> StepTest:
@@ -244,7 +246,7 @@ def _noise(test: StepTest, known: float) -> float:
     return 0.0 if math.isnan(known) else known
 
 
-def _return_time(test: StepTest, noise_known: float) -> float:
+def _return_time(test: StepTest, noise: float) -> float:
     """Return roughly when the measurement is back at its baseline, from the step on [s].
 
     The area between the measurement and its baseline falls while the response is inverse and
@@ -258,8 +260,8 @@ def _return_time(test: StepTest, noise_known: float) -> float:
     interval = np.diff(since, prepend=0.0)
     area = np.cumsum(side * deviation * interval)
     i = int(np.argmin(area))
-    noise = _noise(test, noise_known) * math.sqrt(float(np.sum(interval[: i + 1] ** 2)))
-    least = max(_SIGNIFICANT * noise, _NEGLIGIBLE * float(np.sum(np.abs(deviation) * interval)))
+    scatter = noise * math.sqrt(float(np.sum(interval[: i + 1] ** 2)))
+    least = max(_SIGNIFICANT * scatter, _NEGLIGIBLE * float(np.sum(np.abs(deviation) * interval)))
     if not -area[i] > least:
         raise IdentificationError(
             "the measurement shows no inverse response to the step beyond its noise, or had not "
@@ -274,10 +276,11 @@ def _fitted(test: StepTest, until: float, known: float) -> tuple[StepCurve, Floa
     end = test.begin + _BEYOND * until
     part = test.time <= end
     stride = max(1, int(np.count_nonzero(part)) // _MOST_POINTS)
-    if stride > 1:
-        time, y = _averaged(test.time[part], test.y[part], test.begin, stride)
-    else:
-        time, y = test.time[part], test.y[part]
+    # Neighbours are averaged, those before the step apart from those after it.
+    first = int(np.searchsorted(test.time, test.begin, side="right")) % stride
+    edges = np.arange(first, int(np.count_nonzero(part)), stride)
+    count = np.diff(np.append(edges, np.count_nonzero(part)))
+    time, y = (np.add.reduceat(x[part], edges) / count for x in (test.time, test.y))
     since = time - test.begin
     span = _BEYOND * until
     n = y.size
@@ -335,18 +338,6 @@ def _fitted(test: StepTest, until: float, known: float) -> tuple[StepCurve, Floa
     return curve, np.asarray(covariance)
 
 
-def _averaged(
-    time: FloatArray, y: FloatArray, begin: float, stride: int
-) -> tuple[FloatArray, FloatArray]:
-    """Average neighbouring samples, those before the step apart from those after it."""
-    first = int(np.searchsorted(time, begin, side="right"))
-    edges = np.unique(
-        np.concatenate((np.arange(0, first, stride), np.arange(first, time.size, stride)))
-    )
-    count = np.diff(np.append(edges, time.size))
-    return np.add.reduceat(time, edges) / count, np.add.reduceat(y, edges) / count
-
-
 def _refined(left: Callable[[float], float], near: float, places: FloatArray) -> float:
     """Return the dead time of the least sum of squares, between the two places about one."""
     i = int(np.argmin(np.abs(places - near)))
@@ -364,7 +355,7 @@ def _columns(since: FloatArray, dead_time: float, span: float, powers: int) -> F
     return np.column_stack((moved, np.ones(since.size)))
 
 
-def _values(curve: StepCurve, step: float) -> FloatArray:
+def _values(curve: StepCurve, step: float) -> Sequence[float]:
     """Read extremum and return off the curve, and solve."""
     deviation = curve.polynomial()
     slope = deviation.deriv()
@@ -383,31 +374,10 @@ def _values(curve: StepCurve, step: float) -> FloatArray:
         raise IdentificationError(
             "the measurement does not come back to where it was before the step: record longer"
         )
-    gain, tau1, tau2 = from_step(t1, float(returns[0]), float(deviation(t1)), step)
-    return np.array((gain, tau1, tau2, curve.dead_time))
+    return *from_step(t1, float(returns[0]), float(deviation(t1)), step), curve.dead_time
 
 
 def _real_roots(polynomial: np.polynomial.Chebyshev, span: float) -> FloatArray:
     roots = polynomial.roots()
     real = roots.real[np.abs(roots.imag) < 1e-9 * span]
     return np.sort(real[(real > 1e-9 * span) & (real <= span)])
-
-
-def _report(
-    record: Record, test: StepTest, curve: StepCurve, values: FloatArray
-) -> tuple[FitReport, FloatArray]:
-    """Compare the model with the whole step response."""
-    u = PiecewiseConstant(np.array([test.begin]), np.array([test.step]), 0.0)
-    modelled = float(curve.coefficients[-1]) + response(
-        INTEGRATOR_INVERSE.build(values), test.time, u
-    )
-    rms = math.sqrt(float(np.mean((test.y - modelled) ** 2)))
-    spread = float(np.std(test.y))
-    fitted = np.full(len(record), math.nan)
-    fitted[: test.time.size] = modelled
-    fit = FitReport(
-        residual_rms=rms,
-        noise_std=record.noise_std,
-        fit=1.0 - rms / spread if spread > 0.0 else math.nan,
-    )
-    return fit, fitted
