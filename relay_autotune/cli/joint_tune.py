@@ -103,7 +103,7 @@ class JointLoop(Loop):
             )
         answers = self.answers
         if options.within is None and loop.within is not None:
-            answers.take("within", list(loop.within), "robot_description")
+            answers.take({"within": loop.within}, "robot_description")
         else:
             answers.measured = loop.state.feedback
             what = f"lowest and highest {loop.measured} that {loop.joint} may have"

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from relay_autotune.bag.field_path import first_numbers
 from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, ros_arguments
-from relay_autotune.cli.settings import FORM, Answers, as_flags, with_flags
+from relay_autotune.cli.settings import Answers, as_flags, with_flags
 from relay_autotune.cli.terminal import Working, asked, broken, width
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
 from relay_autotune.exchange.export import Target
@@ -66,10 +66,9 @@ class Loop:
         :param changed: the values by name.
         :raises RelayAutotuneError: if one cannot be.
         """
-        for name, value in changed.items():
-            if name not in self.form:
-                raise SelectionError(f"{name} is no setting of {self.title}")
-            self.answers.take(name, value, FORM[name].question)
+        if unknown := set(changed) - set(self.form):
+            raise SelectionError(f"{', '.join(sorted(unknown))} is no setting of {self.title}")
+        self.answers.take(changed)
 
     def limits(self) -> tuple[float, ...]:
         """Return the lowest and the highest measurement that a tune may see; empty: not known."""

@@ -12,8 +12,8 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
@@ -22,6 +22,8 @@ from relay_autotune.cli.terminal import asked, number_of, pair_of
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import Quantity
+
+NOT_GIVEN = math.nan
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Setting:
         """Return the value of a text; None: it has none."""
         return pair_of if self.is_range else number_of
 
-    def add_to(self, group: argparse._ArgumentGroup) -> None:
+    def add_to(self, group: argparse._ActionsContainer) -> None:
         """Add its flag to some others."""
         default, how = self.quantity.default, dict[str, Any]()
         if self.is_range:
@@ -74,9 +76,10 @@ class Setting:
         elif self.quantity.choices:
             how = {"choices": self.quantity.choices, "metavar": self.metavar}
         else:
-            number = self.quantity.is_number
             how["metavar"] = self.metavar or self.quantity.unit.upper()
-            how |= {"type": finite} if number else {"default": default or None}
+            how["default"] = None if default in ("", NOT_GIVEN) else default
+            if self.quantity.is_number:
+                how["type"] = finite
         group.add_argument(self.flag, dest=self.name, help=self.quantity.description, **how)
 
     def values(self, given: Any) -> dict[str, Any]:
@@ -87,6 +90,12 @@ class Setting:
 
 
 SETTINGS = (
+    Setting(
+        Quantity("amplitude", 0.0, "u").means(
+            "half the distance of the two commands [u]; default: the node's parameter"
+        ),
+        "", "half the distance of the relay's two commands; 0: found by the tune", "0",
+    ),
     Setting(
         Quantity("measurement", "").means("topic that measures"), "TOPIC",
     ),
@@ -112,13 +121,13 @@ SETTINGS = (
         "YAML", parameters=("command_message",),
     ),
     Setting(
-        Quantity("command_period", math.nan, "s").means(
+        Quantity("command_period", NOT_GIVEN, "s").means(
             "send the last command again after this time, for an actuator that stops without"
         ),
         parameters=("command_period",),
     ),
     Setting(
-        Quantity("at", math.nan, "u").means("the present command, at which the process rests"),
+        Quantity("at", NOT_GIVEN, "u").means("the present command, at which the process rests"),
         # The safe command also where a controller_node in front of it has ended.
         "", "present command, at which the process rests", "2.5", ("baseline", "safe_command"),
     ),
@@ -139,7 +148,7 @@ SETTINGS = (
         "LAW",
     ),
     Setting(
-        Quantity("sample_period", math.nan, "s").means(
+        Quantity("sample_period", NOT_GIVEN, "s").means(
             "time between two runs of that program [s]; default: that of the measurement"
         ),
     ),
@@ -150,7 +159,7 @@ SETTINGS = (
         ),
     ),
     Setting(
-        Quantity("step", math.nan, "y").means(
+        Quantity("step", NOT_GIVEN, "y").means(
             "height of that step [y]; default: half of the swing of the tune, at least twenty "
             "times the noise (forty if that is within a third of the way to a limit), as far as "
             "--within and --command-within allow"
@@ -170,15 +179,6 @@ SETTINGS = (
     ),
 )  # fmt: skip
 SETTING = {each.name: each for each in SETTINGS}
-# What moves the plant, which the form of a page asks for; an amplitude of 0 is found by the tune.
-AMPLITUDE = Setting(
-    Quantity("amplitude", 0.0, "u").means(
-        "half the distance of the two commands [u]; default: the node's parameter"
-    ),
-    "", "half the distance of the relay's two commands; 0: found by the tune", "0",
-)  # fmt: skip
-FORM = {each.name: each for each in (*map(SETTING.get, ("at", "within", "command_within")),
-                                     AMPLITUDE) if each}  # fmt: skip
 _FLAGS = {name: each.flag for each in SETTINGS for name in each.parameters}
 # Where a checklist says which parameter of relay_node to set.
 _TYPED = re.compile(r"; type: ros2 param set \S+ (\w+) \w+$")
@@ -206,50 +206,51 @@ class Answers:
     :param options: as the command line gives them; answers are kept there, too.
     :param measured: the present measurement [y]; NaN: not known.
     :param commanded: the present command, if somebody publishes one [u]; NaN: nobody does.
-    :param units: in place of y and u, where they are known.
     """
 
     options: argparse.Namespace
     measured: float = math.nan
     commanded: float = math.nan
-    units: dict[str, str] = field(default_factory=dict)
     _from: dict[str, str] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Any:
         """Return the value of a setting; None: it is not known."""
         return getattr(self.options, name)
 
-    def take(self, name: str, value: Any, source: str) -> None:
-        """Take a value.
+    def take(self, given: Mapping[str, Any], source: str = "") -> None:
+        """Take values, all of them or none.
 
-        :param name: of the setting.
-        :param value: None: it is not known.
-        :param source: where it comes from.
-        :raises SelectionError: if it cannot be.
+        :param given: numbers and ranges by the names of their settings.
+        :param source: where they come from; empty: each is named by its question.
+        :raises SelectionError: if one of them cannot be, beside the others.
         """
-        if value is not None:
+        wanted = replace(self, options=argparse.Namespace(**vars(self.options)))
+        for name, value in given.items():
+            found, ends = _numbers(value), 1 + SETTING[name].is_range
+            if len(found) != ends or found != sorted(set(found)):
+                told = "two numbers, the lower one first" if ends > 1 else "one number"
+                raise SelectionError(f"{SETTING[name].question}: expected {told}")
             # A page sends whole numbers as such, which ROS does not take for a double.
-            value = list(map(float, value)) if FORM[name].is_range else float(value)
-            if why := self.why_impossible(name, value):
-                raise SelectionError(f"{source} {_text(value)}: {why}")
-        setattr(self.options, name, value)
-        self._from[name] = source
+            setattr(wanted.options, name, found if ends > 1 else found[0])
+        for name, value in given.items():
+            if why := wanted.why_impossible(name, wanted[name]):
+                whose = source or SETTING[name].question
+                raise SelectionError(
+                    f"{whose} {' '.join(map('{:g}'.format, _numbers(value)))}: {why}"
+                )
+        vars(self.options).update(vars(wanted.options))
+        self._from.update(dict.fromkeys(given, source))
 
     def source(self, name: str) -> str:
         """Return where a value comes from: its flag, unless something else was said."""
-        return self._from.get(name, FORM[name].flag)
-
-    def unit(self, name: str) -> str:
-        """Return the unit of a setting."""
-        unit = FORM[name].quantity.unit
-        return self.units.get(unit, unit)
+        return self._from.get(name) or SETTING[name].flag
 
     def now(self, name: str) -> str:
         """Return what is seen of a setting's quantity now; empty: nothing."""
         if name == "amplitude":
             return ""
         value = self.measured if name == "within" else self._present_command
-        return "" if math.isnan(value) else f"{value:.4g} {self.unit(name)} now"
+        return "" if math.isnan(value) else f"{value:.4g} {SETTING[name].quantity.unit} now"
 
     @property
     def _present_command(self) -> float:
@@ -286,19 +287,22 @@ class Answers:
         :param example: what may be typed; empty: as its row says.
         :param known: what Enter takes; NaN: nothing.
         """
-        setting = FORM[name]
+        setting = SETTING[name]
         if self[name] is not None:
-            self.take(name, self[name], self.source(name))
+            self.take({name: self[name]}, self.source(name))
             return
         shown = "" if math.isnan(known) else f"{known:.6g}"
         example = example or shown or setting.example
         seen = "" if shown else self.now(name)
-        question = f"{what or setting.question} [{self.unit(name)}]" + f", {seen}" * bool(seen)
+        question = (
+            f"{what or setting.question} [{SETTING[name].quantity.unit}]"
+            + f", {seen}" * bool(seen)
+        )
         value = asked(
             question, setting.flag, shown, example, setting.read,
             lambda found: self.why_impossible(name, found),
         )  # fmt: skip
-        self.take(name, value, "typed")
+        self.take({name: value}, "typed")
 
     def form(self, names: Sequence[str]) -> Iterator[dict[str, Any]]:
         """Yield each of some settings as a form shows it.
@@ -306,13 +310,13 @@ class Answers:
         :param names: of the settings.
         """
         for name in names:
-            setting, value = FORM[name], self[name]
+            setting, value = SETTING[name], self[name]
             if value is None and name == "at" and not math.isnan(self.commanded):
                 value = float(f"{self.commanded:.6g}")
             yield {
                 "name": name,
                 "question": setting.question,
-                "unit": self.unit(name),
+                "unit": SETTING[name].quantity.unit,
                 "values": value if setting.is_range else [value],
                 "ends": 1 + setting.is_range,
                 "now": self.now(name),
@@ -327,9 +331,8 @@ class Answers:
         return found
 
 
-def _text(value: Any) -> str:
-    values = value if isinstance(value, Sequence) else [value]
-    return " ".join(f"{each:g}" for each in values)
+def _numbers(value: Any) -> list[float]:
+    return [float(each) for each in (value if isinstance(value, Sequence) else [value])]
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
@@ -343,7 +346,8 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         "for what it must know, shows the plan, tunes, and ends them",
     )
     for each in SETTINGS:
-        each.add_to(group)
+        # The amplitude is one for every loop.
+        each.add_to(parser if each.name == "amplitude" else group)
 
 
 def add_joint(parser: argparse.ArgumentParser) -> None:
@@ -411,7 +415,10 @@ def kind_of(options: argparse.Namespace) -> Kind:
         return Kind.TOPICS
     for each in SETTINGS:
         # One with a default is not told from one that is not given.
-        if each.name not in ("field", "yes") and getattr(options, each.name) is not None:
+        if (
+            each.name not in ("amplitude", "field", "yes")
+            and getattr(options, each.name) is not None
+        ):
             raise SelectionError(
                 f"{each.flag} is for a loop without nodes: give --measurement and --command, too"
             )

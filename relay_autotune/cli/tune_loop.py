@@ -111,10 +111,6 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Example:\n  tune_loop --namespace tank --amplitude 0.5 --report tank.html",
     )
     parser.add_argument(
-        "--amplitude", type=finite, default=0.0, metavar="U",
-        help="half the distance of the two commands [u]; default: the node's parameter",
-    )  # fmt: skip
-    parser.add_argument(
         "--dry-run", action="store_true", help="only ask whether a tune could start, and how"
     )
     parser.add_argument(

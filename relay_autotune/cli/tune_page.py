@@ -168,12 +168,16 @@ class _LoopOnPage:
     def _show_signals(self) -> None:
         live = self._live
         try:
-            self._client.watch_measurement(lambda value: live.sample("measurement", value))
+            self._client.watch_measurement(self._hear)
             self._commands_shown = self._client.command_watch(
                 lambda value: live.sample("command", value), self._take_cycle
             )
         except RelayAutotuneError as error:
             live.tell(status=str(error), tone="warn")
+
+    def _hear(self, value: float) -> None:
+        self._live.sample("measurement", value)
+        self._loop.answers.measured = value
 
     def _take_cycle(self, cycle: Any) -> None:
         settings = cycle.settings
@@ -192,9 +196,8 @@ class _LoopOnPage:
 
     def _show_form(self) -> None:
         """Show the settings of the next tune."""
-        loop, told = self._loop, self._live.told
-        form = tuple(loop.answers.form(loop.form))
-        if form != told.form:
+        form = tuple(self._loop.answers.form(self._loop.form))
+        if form != self._live.told.form:
             self._live.tell(form=form)
 
     def _is_set(self, wish: PageCommand) -> bool:

@@ -257,6 +257,41 @@ def test_a_flag_that_cannot_be_is_refused_at_once(words: tuple[str, ...], told: 
         TopicLoop(Looker(measures=44.0), options("--at", "2", *words))
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"at": [2.0, 3.0]}, {"within": 5}, {"within": [50, 30]}, {"within": [30, 40]},
+        {"amplitude": -1}, {"command_within": [3, 9]}, {"field": 1}, {"reboot": 1},
+        {"at": 3, "within": [30, 40]},
+    ],
+)  # fmt: skip
+def test_a_form_with_what_cannot_be_changes_nothing(changed: dict[str, Any]) -> None:
+    given = options("--at", "2", "--within", "30", "50", "--command-within", "0", "5")
+    loop = TopicLoop(Looker(measures=44.0), given)
+    before = dict(vars(given))
+    with pytest.raises(SelectionError):
+        loop.set(changed)
+    assert vars(given) == before
+
+
+def test_a_form_that_can_be_goes_to_relay_node_as_numbers() -> None:
+    client: Any = Looker(measures=44.0)
+    client.name, sent = "/tank/relay_node", {}
+    client.set_values = lambda node, values: sent.update(values)
+    loop = TopicLoop(client, options("--web"))
+    assert [row["values"] for row in loop.answers.form(loop.form)] == [[None], None, None, [0.0]]
+    loop.set({"at": 2, "within": [30, 50], "command_within": [0, 5], "amplitude": 1})
+    assert sent == {
+        "baseline": 2.0, "safe_command": 2.0, "measurement_min": 30.0, "measurement_max": 50.0,
+        "command_min": 0.0, "command_max": 5.0,
+    }  # fmt: skip
+    assert all(isinstance(value, float) for value in sent.values())
+    assert loop.options.amplitude == 1.0
+    # What excludes what was before, and not each other.
+    loop.set({"at": 12, "command_within": [10, 20]})
+    assert sent["baseline"] == 12.0
+
+
 def test_where_nobody_can_be_asked_the_flag_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
     with pytest.raises(LoopError, match="give --at"):
