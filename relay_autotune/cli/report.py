@@ -284,15 +284,20 @@ def flags_of(values: Mapping[str, Any]) -> str:
 
 
 def analysed_as_there(
-    record: Record, values: Mapping[str, Any], tell: Callable[[str], None] = lambda _: None
+    record: Record,
+    values: Mapping[str, Any],
+    tell: Callable[[str], None] = lambda _: None,
+    *,
+    alone: bool = False,
 ) -> Analysis:
     """Identify and tune as the identifier_node does.
 
     :param record: the samples.
     :param values: of its parameters, by name.
     :param tell: called with what begins.
+    :param alone: True: without the other methods and rules, which take most of the time.
     """
-    return analyse(record, **vars(task_from(values)), tell=tell)
+    return analyse(record, **vars(task_from(values)), tell=tell, alone=alone)
 
 
 def defaults() -> dict[str, Any]:

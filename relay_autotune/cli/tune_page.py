@@ -52,7 +52,8 @@ from relay_autotune.nodes.identifier_parameters import options_from
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.record.record import Record
-from relay_autotune.report.case import EstimatedQuantity, case_of, model_case
+from relay_autotune.report.case import Case, EstimatedQuantity, case_of, model_case
+from relay_autotune.result import Analysis
 from relay_autotune.text import digits
 from relay_autotune.verdict import Verdict
 from relay_autotune.web.address import address_of
@@ -260,7 +261,7 @@ class _LoopOnPage:
         print("\n".join(lines), flush=True)
         live.tell(
             phase="analysing",
-            status="model and gains are computed once more, to shape them",
+            status="the model is computed once more, to shape the gains",
             result=tuple(lines),
         )
         if result.transfer_function.experiment_id:
@@ -350,13 +351,13 @@ class _LoopOnPage:
     # The result of a tune.
 
     def _add_subject(self, result: Any) -> None:
-        """Show the model of the tune, and let its gains be shaped."""
+        """Show the model of the tune, and let its gains be shaped; other rules come later."""
         try:
             record = self._client.record(_PATIENCE)
             values = self._client.identifier_values(_PATIENCE) or defaults()
             found = _awaited(
                 self._client,
-                self._page.slow.ask(partial(analysed_as_there, record, values)),
+                self._page.slow.ask(partial(analysed_as_there, record, values, alone=True)),
                 lambda: bool(self._interrupted),
             )
         except RelayAutotuneError as error:
@@ -374,11 +375,25 @@ class _LoopOnPage:
             wanted = {name: math.nan if v is None else v for name, v in changed.items()}
             return f"replay {shlex.quote(bag)} {flags_of({**values, **wanted})}".rstrip()
 
-        case = case_of(found, bag or self._loop.title)
-        case = replace(case, command=command(first))
+        def shown(found: Analysis) -> Case:
+            return replace(case_of(found, bag or self._loop.title), command=command(first))
+
         target = self._loop.target
-        subject = PageModel(case, found.shaping, first, command, self._number, target)
+        subject = PageModel(shown(found), found.shaping, first, command, self._number, target)
         self._page.add(subject)
+
+        def completed() -> None:
+            every = shown(analysed_as_there(record, values))
+            subject.case = replace(every, present=subject.case.present)
+            self._page.changed()
+
+        # The recommended gains may be used meanwhile.
+        self._page.slow.ask(completed).add_done_callback(self._say_what_lacks)
+
+    def _say_what_lacks(self, work: Future[None]) -> None:
+        ends = work.cancelled() or bool(self._interrupted)
+        if not ends and (error := work.exception()) is not None:
+            say(PROGRAM, f"the page shows one method and one rule alone: {error}")
 
 
 def _awaited(client: TuneClient, work: Future[_Result], leave: Callable[[], bool]) -> _Result:

@@ -81,6 +81,8 @@ class Page:
         lives: Sequence[Live] = (),
     ) -> None:
         self.subjects: list[PageModel] = []
+        self.revision = 0
+        """Number of changes of what is shown of the models."""
         self.address = address
         self.lives = tuple(lives)
         self.computes_ahead = True
@@ -107,8 +109,13 @@ class Page:
         with self._adding:
             self.subjects.append(subject)
             number = len(self.subjects) - 1
+        self.changed()
         if subject.shaping is not None:
             self.worker.ask(partial(self._answer, number, subject.first))
+
+    def changed(self) -> None:
+        """Tell all pages what is shown of the models."""
+        self.revision += 1
 
     def _next_ahead(self) -> Callable[[], object] | None:
         """Return what to compute ahead: what the slider can ask for next, once somebody asked."""
@@ -370,7 +377,7 @@ class _Socket(_Guarded, WebSocketHandler):
             self.write_message(text)
 
     def _tell_subjects(self) -> None:
-        self._shown = len(self.page.subjects)
+        self._shown = self.page.revision
         self.tell(self.page.everything())
 
     def on_close(self) -> None:
@@ -442,7 +449,7 @@ class _Socket(_Guarded, WebSocketHandler):
         )
 
     def _tell_news(self) -> None:
-        if self._shown != len(self.page.subjects):
+        if self._shown != self.page.revision:
             self._tell_subjects()
         for number, subject in enumerate(self.page.subjects):
             asked = self._asked.get(number, subject.first).apart_from_ms

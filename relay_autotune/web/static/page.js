@@ -373,7 +373,12 @@ function take(message) {
     const newest = own[own.length - 1];
     // After a tune its own result is shown, else what the address says.
     if (!own.length) showLoop();
-    else if (before && newest < before) showSubject();
+    else if (before && newest < before) {
+      // Other rules of the same model have come.
+      showSubject();
+      showControls();
+      if (shaped) showShaped(shaped, false);
+    }
     else choose(!before && own.includes(of) ? of : newest);
     return;
   }
