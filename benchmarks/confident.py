@@ -176,7 +176,7 @@ class Bench:
         ended_by, fit = FitProgress(), RunningFit()
         for k in range(_MOST_SAMPLES):
             plant.command(tune.step(k * self.period, plant.measure(k * self.period)))
-            if tune.finished or 0.0 < least < tune.elapsed - tune.kicked_at:
+            if tune.finished or 0.0 < least < tune.elapsed - tune.facts.kicked_at:
                 break
             if early is not None and early.is_due(tune):
                 early.look(tune)
@@ -189,7 +189,7 @@ class Bench:
 
     def _classic(self) -> tuple[Length, Record]:
         tune, _ = self._run(0.0, 0, None)
-        return Length(tune.elapsed - tune.kicked_at, tune.cycle_count), tune.record()
+        return Length(tune.elapsed - tune.facts.kicked_at, tune.cycle_count), tune.record()
 
     def confident(self, seed: int, sought: str) -> Length:
         """Run a test until what is sought is known well enough."""
@@ -198,7 +198,7 @@ class Bench:
         error = abs(found.ultimate_gain / self.truth - 1.0)
         if sought != ULTIMATE_GAIN and tune.finished:
             error = abs(self._true_ms(tune.record()) / found.ms - 1.0)
-        return Length(tune.elapsed - tune.kicked_at, 0.5 * tune.switches, error)
+        return Length(tune.elapsed - tune.facts.kicked_at, 0.5 * tune.switches, error)
 
     def _true_ms(self, record: Record) -> float:
         """Return the Ms of the gains after a test on the process; NaN: there are none."""
@@ -215,7 +215,7 @@ class Bench:
         tune, _ = self._run(self.noise, seed, None, least=longest)
         times = longest * np.arange(1, round(_LONGEST * _GRID) + 1) / (_LONGEST * _GRID)
         found = NORMAL_95 * relative_bounds(
-            self.case.model, tune.record(), self.noise, tune.kicked_at + times
+            self.case.model, tune.record(), self.noise, tune.facts.kicked_at + times
         )
         enough = np.flatnonzero(found <= self.case.asked)
         least = float(times[enough[0]]) if enough.size else math.inf

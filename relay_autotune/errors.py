@@ -84,15 +84,7 @@ class LoopError(RelayAutotuneError, RuntimeError):
 
 
 class NotReadyError(RelayAutotuneError):
-    """A tune, or a verification, that cannot start.
-
-    :param message: the reason.
-    :param typed: the parameter to set, and a value or what it stands for; empty: another remedy.
-    """
-
-    def __init__(self, message: str, typed: str = "") -> None:
-        super().__init__(message)
-        self.typed = typed
+    """A tune, or a verification, that cannot start."""
 
 
 def defect(error: BaseException) -> str:

@@ -56,6 +56,11 @@ class Reason:
         """The values by name."""
         return dict(self.facts)
 
+    @property
+    def typed(self) -> str:
+        """The parameter to set, and a value or what it stands for; empty: another remedy."""
+        return _filled(self.code.row.typed, self.values)
+
     def plus(self, *notes: Reason, **values: Value) -> Reason:
         """Return the reason with further notes and values.
 
@@ -391,8 +396,8 @@ class Code(enum.IntEnum):
     )
     REACH_UNKNOWN = _Row(
         143,
-        f"{_REACH}[; max_cycles, {{most}}, reached][; {{which}} cycles agree within {{percent:g}} "
-        "%, allowing for noise]",
+        f"{_REACH}[; max_cycles, {{most}}, reached][; the last {{needed}} cycles do not agree "
+        "within {percent:g} %][; {which} cycles agree within {percent:g} %, allowing for noise]",
         "",
         "Noise hid the oscillation at a quarter of the amplitude, so that it is not known whether "
         "the actuator reaches the levels.",
@@ -517,16 +522,15 @@ class Code(enum.IntEnum):
 
     # Between two nodes: at the start, and while a tune runs.
     SECOND_PUBLISHER = _Row(
-        230,
+        250,
         "{topic} is also published by {others}: two of them would fight for the actuator[; "
         "{remap}]",
         "",
         "A second node commands: stop it, or connect it to controller_command. One that was "
         "killed is forgotten after about 20 s.",
-        transient=True,
     )
     SECOND_SOURCE = _Row(
-        231,
+        251,
         "{topic} is published by {count} publishers, {others}, expected one: the relay would act "
         "on a mixture",
         "end the others (a killed one leaves the graph after 20 s)",
@@ -534,7 +538,7 @@ class Code(enum.IntEnum):
         "that crashed: ros2 topic info --verbose shows both.",
     )
     NAMESAKE = _Row(
-        232,
+        252,
         "{count} nodes have the name {node}, expected one: a call reaches any of them",
         "end the others (a killed one leaves the graph after 20 s), or give them other names",
         "Two relay_nodes, as after a crash of ros2 run.",
@@ -547,13 +551,18 @@ class Code(enum.IntEnum):
         "wait for its end or call {node}/abort",
         "One relay_node runs one tune at a time.",
     )
-    NO_MEASUREMENT = _Row(
+    NO_MEASUREMENT_YET = _Row(
         301,
-        "no measurement has come {when}: {why}",
+        "no measurement has come yet: {why}",
         "",
         "A best-effort sensor, another type, another topic, or no sensor: the sentence says "
         "which; see measurement_type and measurement_field.",
         transient=True,
+    )
+    NO_MEASUREMENT_NOW = _Row(
+        316,
+        "no measurement has come for {silence:.3g} s: {why}",
+        meaning="The sensor has fallen silent.",
     )
     NO_CLOCK = _Row(
         302,
@@ -615,7 +624,6 @@ class Code(enum.IntEnum):
         "connect the controller of the present loop, with path passthrough, or give "
         "controller_command_field where the messages of the measurement have it",
         "A relay on the set-point needs a closed loop.",
-        transient=True,
     )
     BUSY_COMMAND = _Row(
         310,
@@ -649,12 +657,16 @@ class Code(enum.IntEnum):
         "wait for its end or call {node}/abort",
         "Parameters hold for a whole tune.",
     )
-    NOT_THE_MODEL = _Row(
+    REST_UNKNOWN = _Row(
+        317,
+        "not known yet, since few samples have come",
+        meaning="The node has just begun to hear the sensor.",
+    )
+    NO_IDENTIFIER = _Row(
         315,
         "no identifier_node: a recording alone, without model and gains",
         "type: ros2 run relay_autotune identifier_node{where}",
         "No identifier_node runs in that namespace, or it is not found yet.",
-        transient=True,
     )
 
     # Model and gains.

@@ -141,16 +141,18 @@ def laws_table(what: str) -> str:
 
 
 def reasons_table(first: int) -> str:
-    """Return a table of a hundred reasons, notes left out.
+    """Return a table of the reasons of a hundred, or of the half of it from 50 on; without notes.
 
     :param first: their first number.
     """
+    stop = first + 50 if first % 100 or first == 200 else first + 100
     lines = ["| code | sentence | what is behind it, and what to do |", "|---|---|---|"]
-    for code in Code:
+    for code in sorted(Code):
         row = code.row
-        if first <= code < first + 100 and row.meaning:
+        if first <= code < stop and row.meaning:
             remedy = row.remedy and f" {row.remedy[0].upper()}{row.remedy[1:]}."
-            cells = (f"{code} `{code.name}`", f"`{row.found}`", f"{row.meaning}{remedy}")
+            found, then = (re.sub(r":[^{}]*}", "}", t) for t in (row.found, row.meaning + remedy))
+            cells = (f"{code} `{code.name}`", f"`{found}`", then)
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 

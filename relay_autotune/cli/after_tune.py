@@ -52,11 +52,15 @@ from relay_autotune.exchange.export import (
     exports_of,
     node_parameters,
 )
-from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
+from relay_autotune.exchange.messages import (
+    gains_from_message,
+    reason_from_message,
+    transfer_function_from_message,
+)
 from relay_autotune.loop.gains import Gains
-from relay_autotune.nodes.lifetime import NODE_FAILED
 from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.nodes.tables import FIXED, GAINS, parameters_of_law
+from relay_autotune.reasons import Code
 from relay_autotune.text import digits
 from relay_autotune.verdict import Verdict
 
@@ -190,7 +194,7 @@ class AfterTune:
             return [("prove the gains", f"{again} --verify")] if wanted else []
         if result.outcome == result.COMPLETED:
             return []
-        if result.reason.startswith(NODE_FAILED):
+        if result.why.code == Code.NODE_FAILED:
             # The same command again would meet the same defect.
             return [
                 ("report it", "this is a defect: send its reason, and the recording if you can")
@@ -198,8 +202,8 @@ class AfterTune:
         if told := loop.instead():
             return [("once it rests", told)]
         steps = [*loop.first(), ("run it again", again)]
-        if result.reason.startswith("no measurement on "):
-            topic = result.reason.split()[3]
+        if result.why.code == Code.SILENT_SENSOR:
+            topic = reason_from_message(result.why)["topic"]
             told = f"the sensor (ros2 topic hz {topic}) and the load of the machine (uptime)"
             steps.append(("if it happens again", f"look at {told}"))
         return steps

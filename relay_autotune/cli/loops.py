@@ -24,7 +24,7 @@ from relay_autotune.cli.settings import Answers, as_flags, with_flags
 from relay_autotune.cli.terminal import Working, asked, broken, width
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
 from relay_autotune.exchange.export import Target
-from relay_autotune.experiment.settling import NO_REST_AT
+from relay_autotune.reasons import Code
 
 if TYPE_CHECKING:
     from relay_autotune.loop.gains import Controller
@@ -261,7 +261,7 @@ class TopicLoop(Loop):
     @property
     def _rests_elsewhere(self) -> bool:
         """Whether the process did not rest at the command that was said to be the present one."""
-        return bool(self.client.result.reason.startswith(NO_REST_AT))
+        return bool(self.client.result.why.code == Code.NOT_AT_BASELINE)
 
     @cached_property
     def left_its_limits(self) -> bool:

@@ -37,6 +37,7 @@ from relay_autotune.cli.terminal import Help, Working, agrees, require_new, widt
 from relay_autotune.cli.tune_view import TICK, Shown, check_lines, follow
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
+from relay_autotune.reasons import Code
 
 if TYPE_CHECKING:
     from relay_autotune.cli.loops import Loop
@@ -44,9 +45,6 @@ if TYPE_CHECKING:
     from relay_autotune.nodes.tune_client import TuneClient
 
 _Client = TypeVar("_Client", bound="LoopClient")
-# Parts of the checklist's lines on rest while few samples have come, and on the model while
-# identifier_node is not discovered.
-NOT_KNOWN_YET, NO_MODEL = "not known yet", "no identifier_node"
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -296,10 +294,13 @@ class Session:
         options, client = self._options, loop.client
         with Working("looking at the loop"):
             while True:
-                checks = list(client.check(options.amplitude).checks)
+                found = client.check(options.amplitude)
+                checks = list(found.checks)
                 # Right after its start the node does not know all of these yet.
-                awaited = (NOT_KNOWN_YET,) if options.record_only else (NOT_KNOWN_YET, NO_MODEL)
-                lacking = any(text in line for line in checks for text in awaited)
+                awaited = {Code.REST_UNKNOWN, Code.NO_IDENTIFIER}
+                if options.record_only:
+                    awaited.remove(Code.NO_IDENTIFIER)
+                lacking = any(reason.code in awaited for reason in found.refusals)
                 if not (client.not_ready_yet or lacking) or time.monotonic() > deadline:
                     break
                 time.sleep(TICK)

@@ -85,6 +85,18 @@ def fill_reason(message: Any, reason: Reason) -> None:
     message.values = [str(value) for _, value in reason.facts]
 
 
+def fill_whys(message: Any, reason: Reason) -> None:
+    """Write a reason with its notes into the fields ``why`` and ``notes`` of a message.
+
+    :param message: the message to fill.
+    :param reason: the reason.
+    """
+    fill_reason(message.why, reason)
+    for note in reason.notes:
+        message.notes.append(type(message.why)())
+        fill_reason(message.notes[-1], note)
+
+
 def reason_from_message(message: Any, said: str = "", notes: Iterable[Any] = ()) -> Reason:
     """Read a `Reason` message.
 
@@ -151,10 +163,7 @@ def fill_experiment(message: Any, record: Record, *, arrays: bool = True) -> Non
     message.experiment_id = record.experiment_id
     message.outcome = int(record.outcome)
     message.reason = record.reason
-    fill_reason(message.why, record.why)
-    for note in record.why.notes:
-        message.notes.append(type(message.why)())
-        fill_reason(message.notes[-1], note)
+    fill_whys(message, record.why)
     fill_settings(message.settings, record.settings)
     message.noise_std = float(record.noise_std)
     message.lost_samples = int(record.lost_samples)

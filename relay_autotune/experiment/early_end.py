@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from relay_autotune.errors import ParameterError
 from relay_autotune.quantities import NORMAL_95, result_field
+from relay_autotune.reasons import Code, Reason
 
 if TYPE_CHECKING:
     from relay_autotune.experiment.experiment import RelayExperiment
@@ -103,7 +104,7 @@ class EarlyEnd:
         """
         if running.switches < _LEAST_SWITCHES:
             return False
-        since = running.elapsed - running.kicked_at
+        since = running.elapsed - running.facts.kicked_at
         if running.switches != self._switches:
             return since >= _LEAST_GROWTH * self._last
         return not self._waits and since >= self._growth * self._last
@@ -114,11 +115,11 @@ class EarlyEnd:
         :param running: the experiment.
         """
         self._switches = running.switches
-        self._last = running.elapsed - running.kicked_at
+        self._last = running.elapsed - running.facts.kicked_at
         self._waits = True
 
-    def judge(self, running: RelayExperiment, found: FitProgress) -> str:
-        """Take the answer to a look; return why the experiment may end, "" if it may not.
+    def judge(self, running: RelayExperiment, found: FitProgress) -> Reason | None:
+        """Take the answer to a look; return why the experiment may end, None if it may not.
 
         :param running: the experiment.
         :param found: result of its newest fit.
@@ -129,9 +130,11 @@ class EarlyEnd:
         self._growth = min(max(growth, _LEAST_GROWTH), _MOST_GROWTH)
         self._waits = False
         if not width <= self.wanted or running.switches < _LEAST_SWITCHES:
-            return ""
-        return (
-            f"after {running.switches} switches, {running.cycle_count} whole cycles, the 95 % "
-            f"interval of {_NAMES[self.sought]} is within {width:.3g} of it, as narrow as asked, "
-            f"{self.wanted:g}"
+            return None
+        return Code.CONFIDENT(
+            switches=running.switches,
+            cycles=running.cycle_count,
+            quantity=_NAMES[self.sought],
+            width=width,
+            wanted=self.wanted,
         )

@@ -1,12 +1,25 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The relay experiment: it takes samples, answers with commands and records both."""
+"""The relay experiment: it takes samples, answers with commands and records both.
+
+The states, the command in each of them, and what leads from one to the next::
+
+    SETTLING   the baseline               steady, or settle_time over            -> KICK
+    KICK       one level of the relay     response seen, sign of the gain given  -> RELAY
+                                          response seen, sign unknown            -> PROBE
+    PROBE      the high level for a       direction clear                        -> RELAY
+               moment, then the baseline  nothing left of the response           -> KICK
+    RELAY      the relay's                cycles agree, or max_cycles            -> COMPLETED
+
+In any state, a watch of the list below, a part that takes too long, or a request from outside
+leads to ABORTED or FAILED. In these and in COMPLETED the command is that of the policy.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -20,16 +33,36 @@ from relay_autotune.experiment.faults import (
     SilenceWatch,
 )
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.procedure import Procedure
-from relay_autotune.experiment.samples import State
-from relay_autotune.record.record import Outcome, Record
+from relay_autotune.experiment.phases import Kick, Phase, Probe, Settle
+from relay_autotune.experiment.relay_law import Levels
+from relay_autotune.experiment.samples import (
+    Ended,
+    Event,
+    Facts,
+    Left,
+    Samples,
+    Setup,
+    State,
+    failed,
+)
+from relay_autotune.experiment.switching import Switching
+from relay_autotune.reasons import NONE, Code, Reason, other
+from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 
 __all__ = ["ExperimentParameters", "RelayExperiment", "SafePolicy", "State"]
 
 _BASELINE = SafePolicy()
 
+_TRANSITIONS: Mapping[tuple[State, Event], tuple[State, Callable[[Setup, Facts], Phase]]] = {
+    (State.SETTLING, Event.STEADY): (State.KICK, Kick),
+    (State.KICK, Event.RESPONSE): (State.RELAY, Switching),
+    (State.KICK, Event.UNSIGNED_RESPONSE): (State.PROBE, Probe),
+    (State.PROBE, Event.DIRECTION): (State.RELAY, Switching),
+    (State.PROBE, Event.NO_DIRECTION): (State.KICK, Kick),
+}
 
-class RelayExperiment(Procedure):
+
+class RelayExperiment:
     """Run one relay experiment: call :meth:`step` for each measurement and send its command.
 
     >>> from relay_autotune import (
@@ -45,10 +78,8 @@ class RelayExperiment(Procedure):
     ('COMPLETED', 3)
     >>> record = test.record()
 
-    :mod:`relay_autotune.experiment.procedure` has the states. In any state, :meth:`abort` and a
-    measurement outside its limits end the experiment as ABORTED; an unusable sample, a frozen
-    sensor and max_duration end it as FAILED. Bad data raise no exception: :attr:`reason` says why
-    the experiment ended. There is no clock here: time comes with the samples, from any origin.
+    Bad data raise no exception: :attr:`why` and :attr:`reason` say why the experiment ended. There
+    is no clock here: time comes with the samples, from any origin.
 
     :param parameters: the user's parameters.
     :param baseline: command of the operating point [u].
@@ -77,22 +108,98 @@ class RelayExperiment(Procedure):
         before: Sequence[float] | None = None,
     ) -> None:
         parameters.validate(baseline)
-        super().__init__(
-            parameters,
-            baseline,
-            until_converged=until_converged,
-            from_small=from_small,
-            before=before,
-        )
+        self.parameters = parameters
+        self.baseline = float(baseline)
         self.experiment_id = experiment_id
         self.safe_command = self.baseline if math.isnan(policy.command) else policy.command
         """Command after an abort or a failure, without proportional hold of the process [u]."""
+        self.state = State.SETTLING
+        """The present state."""
+        self._levels = Levels(parameters, self.baseline, from_small=from_small)
+        self._trace = Samples()
+        self._notes: list[Reason] = []
+        self._setup = Setup(
+            parameters, self.baseline, until_converged, self._levels, self._trace, self._notes
+        )
+        self._phase: Phase = Settle(self._setup, before)
+        self._facts = Facts(sign=parameters.process_gain_sign)
+        self._why = NONE
         self._policy = policy
         self._hold: ProportionalHold | None = None
         self._frozen = FrozenWatch()
         self._silence = SilenceWatch()
         self._check = SampleCheck()
         self._origin = math.nan
+
+    # What is known of it.
+
+    @property
+    def _relay(self) -> Switching | None:
+        return self._phase if isinstance(self._phase, Switching) else None
+
+    @property
+    def facts(self) -> Facts:
+        """What has been found so far."""
+        return self._facts if self._relay is None else self._relay.facts
+
+    @property
+    def cycles(self) -> tuple[Cycle, ...]:
+        """The whole cycles so far."""
+        return () if self._relay is None else self._relay.cycles
+
+    @property
+    def cycle_start(self) -> tuple[int, ...]:
+        """Index of the first sample of each cycle, as in a record."""
+        return () if self._relay is None else self._relay.cycle_start
+
+    @property
+    def switches(self) -> int:
+        """Number of switches of the relay so far; two of them are a half cycle."""
+        return 0 if self._relay is None else self._relay.switches
+
+    @property
+    def is_tried(self) -> bool:
+        """True unless it is not known yet whether the actuator follows the levels."""
+        return not self._levels.from_small if self._relay is None else self._relay.is_tried
+
+    @property
+    def latest(self) -> float:
+        """Deadline of the present state, from the first sample, gaps not counted [s].
+
+        It grows when a state begins, or takes longer than before; an experiment beyond it has
+        failed. Infinite if only max_duration limits the state.
+        """
+        return self._phase.latest
+
+    @property
+    def settings(self) -> RelaySettings | None:
+        """The relay's settings; None until the measurement has settled.
+
+        While the sign of the process gain is not known, ``reverse_acting`` is False.
+        """
+        facts = self.facts
+        if not facts.rest.samples:
+            return None
+        return RelaySettings(
+            setpoint=facts.setpoint,
+            baseline=self.baseline,
+            amplitude=self._levels.amplitude,
+            bias=self._levels.bias,
+            hysteresis=facts.hysteresis,
+            extra_delay=self.parameters.extra_delay,
+            sample_period=self.parameters.sample_period,
+            reverse_acting=facts.sign < 0,
+        )
+
+    @property
+    def noise_std(self) -> float:
+        """Standard deviation of the measurement at rest [y]; NaN until it has settled."""
+        return self.facts.rest.noise_std
+
+    @property
+    def cycle_count(self) -> int:
+        """Number of whole cycles so far."""
+        return len(self.cycles)
 
     @property
     def finished(self) -> bool:
@@ -105,38 +212,41 @@ class RelayExperiment(Procedure):
         return Outcome[self.state.name] if self.finished else Outcome.UNKNOWN
 
     @property
+    def why(self) -> Reason:
+        """Why it ended, with notes; its code is NONE before."""
+        if not self._why:
+            return NONE
+        notes, silent = [*self._notes], self._silence.silence
+        if repeated := self._silence.repeated:
+            at_end = self.outcome is not Outcome.COMPLETED and silent > 0.0
+            notes.append(
+                Code.NOTE_REPEATED(samples=repeated, **({"silence": silent} if at_end else {}))
+            )
+        return self._why.plus(*notes)
+
+    @property
     def reason(self) -> str:
         """Why it ended, a sentence for people; empty before."""
-        if not self.why_ended:
-            return ""
-        reason, repeated = "; ".join((self.why_ended, *self.notes)), self._silence.repeated
-        if not repeated:
-            return reason
-        told = f"{reason}; {repeated} samples repeat the one before, since the sensor was silent"
-        silent = self._silence.silence
-        if self.outcome is Outcome.COMPLETED or not silent > 0.0:
-            return told
-        return f"{told}, at the end for {silent:.3g} s: check it first"
+        return str(self.why)
 
     @property
     def status(self) -> str:
         """What it waits for and what it sees, or how it ended, a sentence for people."""
-        trace = self.trace
         if self.finished:
             return f"{self.outcome.name.lower()}: {self.reason}"
-        if not trace:
+        if not self._trace:
             return "waiting for the first measurement"
-        return self._tell(trace.seen[-1], trace.measurement[-1])
+        return self._phase.status(*self._setup.now)
 
     @property
     def sample_count(self) -> int:
         """Number of samples recorded."""
-        return len(self.trace)
+        return len(self._trace)
 
     @property
     def elapsed(self) -> float:
         """Time from the first sample to the last [s]."""
-        return self.trace.time[-1] if self.trace else 0.0
+        return self._trace.time[-1] if self._trace else 0.0
 
     @property
     def cycles_left(self) -> int:
@@ -160,7 +270,7 @@ class RelayExperiment(Procedure):
 
     def samples(self, first: int, stop: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return time [s], measurement [y] and command [u] of the samples first to stop - 1."""
-        return self.trace.columns(first, stop)
+        return self._trace.columns(first, stop)
 
     def record(
         self,
@@ -182,8 +292,8 @@ class RelayExperiment(Procedure):
         :raises RecordError: if there is no sample.
         """
         # If the caller raised while a sample was being answered, that sample has no answer.
-        n = len(self.trace.command)
-        time, measurement, command = self.trace.columns(0, n)
+        n = len(self._trace.command)
+        time, measurement, command = self._trace.columns(0, n)
         return Record(
             time=time,
             measurement=measurement,
@@ -195,6 +305,7 @@ class RelayExperiment(Procedure):
             cycle_start=self.cycle_start,
             outcome=self.outcome,
             reason=self.reason,
+            why=self.why,
             experiment_id=self.experiment_id,
             start=start,
             lost_samples=lost_samples,
@@ -222,24 +333,30 @@ class RelayExperiment(Procedure):
         return self._take(time, measurement, repeated=True)
 
     def _take(self, time: float, measurement: float, *, repeated: bool) -> float:
-        trace = self.trace
+        trace = self._trace
         if self.finished:
             return self.after_end(measurement)
         last = trace.time[-1] if trace else -math.inf
         problem = self._check.problem(time, measurement, last, self._origin)
         if problem is not None:
-            self.end(State.FAILED, problem)
-            return self._ended(math.nan)
+            return self._end(failed(problem), math.nan)
         if not trace:
             self._origin = float(time)
         t, y = float(time) - self._origin, float(measurement)
         trace.add(t, y)
-        over = self._passes_limit(t, y) or self._is_dead(t, y, repeated=repeated)
-        command = self.baseline if over else self._answer(trace.seen[-1], y)
-        if self.state >= State.COMPLETED:
-            command = self._ended(y)
+        end = self._passes_limit(t, y) or self._is_dead(t, y, repeated=repeated)
+        found = end or self._phase.answer(trace.seen[-1], y)
+        if isinstance(found, Left):
+            self._facts = found.facts
+            self.state, begin = _TRANSITIONS[self.state, found.event]
+            self._phase = begin(self._setup, found.facts)
+            found = self._phase.command
+        if isinstance(found, Ended):
+            command = self._end(found, y)
         elif self.parameters.command_rate > 0.0:
-            command = self._rate_limited(command)
+            command = self._rate_limited(found)
+        else:
+            command = found
         trace.command.append(command)
         return command
 
@@ -254,10 +371,10 @@ class RelayExperiment(Procedure):
             return self.baseline
         return self.safe_command
 
-    def conclude(self, reason: str) -> float:
+    def conclude(self, reason: Reason | str) -> float:
         """Complete the experiment now, with the data so far; do nothing if it has ended.
 
-        :param reason: why, for people.
+        :param reason: why; a sentence stands for a reason without a code.
         :returns: the command of :meth:`after_end` [u], to be sent now.
         :raises ParameterError: before the first half cycle, when too little is known.
         """
@@ -266,90 +383,74 @@ class RelayExperiment(Procedure):
                 raise ParameterError(
                     "an experiment cannot be completed before its first half cycle; abort it"
                 )
-            self.end(State.COMPLETED, reason)
-            self._ended(math.nan)
+            self._end(Ended(State.COMPLETED, _reason(reason)), math.nan)
         return self.after_end(self._last_measurement())
 
-    def abort(self, reason: str, time: float | None = None) -> float:
+    def abort(self, reason: Reason | str, time: float | None = None) -> float:
         """End the experiment from outside; do nothing if it has ended already.
 
-        :param reason: why, for people.
+        :param reason: why; a sentence stands for a reason without a code.
         :param time: when [s], on the axis of :meth:`step`; default: at the last sample.
         :returns: the command of :meth:`after_end` [u], to be sent now.
         """
         if not self.finished:
-            at = self.elapsed if time is None or not self.trace else time - self._origin
-            self.end(State.ABORTED, f"{reason} (at {at:.6g} s, {self._where()})")
-            self._ended(math.nan)
+            at = self.elapsed if time is None or not self._trace else time - self._origin
+            why = _reason(reason).plus(ended_at=at, where=self._phase.where)
+            self._end(Ended(State.ABORTED, why), math.nan)
         return self.after_end(self._last_measurement())
 
     def _last_measurement(self) -> float:
-        return self.trace.measurement[-1] if self.trace else math.nan
+        return self._trace.measurement[-1] if self._trace else math.nan
 
-    def _ended(self, measurement: float) -> float:
+    def _end(self, end: Ended, measurement: float) -> float:
+        """End the experiment; return the command that answers a measurement [u]."""
+        self.state, self._why = end.state, end.why
         if self._policy.hold and not self._policy.give_back:
             self._hold = ProportionalHold.after(self.settings, self.cycles, self._policy.gain)
         return self.after_end(measurement)
 
     def _rate_limited(self, wanted: float) -> float:
-        samples = self.trace
+        samples = self._trace
         if len(samples) < 2:
             return wanted
         before = samples.command[-1]
         step = self.parameters.command_rate * (samples.time[-1] - samples.time[-2])
         return min(max(wanted, before - step), before + step)
 
-    def _passes_limit(self, t: float, y: float) -> bool:
-        """End the experiment if the last sample passes a limit; return True if it does."""
-        p, resting = self.parameters, self.state is State.SETTLING
-        if not p.measurement_min <= y <= p.measurement_max:
-            self.end(
-                State.ABORTED,
-                f"the measurement {y:g} at {t:g} s is outside its limits, {p.measurement_min:g} "
-                f"to {p.measurement_max:g}",
-            )
-        elif p.max_deviation > 0.0 and not resting and self._deviation(y) > p.max_deviation:
-            self.end(
-                State.ABORTED,
-                f"the measurement {y:g} at {t:g} s is {self._deviation(y):g} away from the "
-                f"set-point, more than max_deviation, {p.max_deviation:g}",
-            )
-        elif 0.0 < p.max_duration < t:
-            self.end(
-                State.FAILED,
-                f"max_duration {p.max_duration:g} s was over {self._where()}: allow more time "
-                f"or fewer cycles",
-            )
-        elif (seen := self.trace.seen[-1]) > self.latest:
-            self.end(
-                State.FAILED,
-                f"the experiment was not over after {seen:.4g} s, longer than its parts may take, "
-                f"{self._where()}: let the process rest and look at the recording first",
-            )
-        return self.finished
+    # The watches of every state.
 
-    def _is_dead(self, t: float, y: float, *, repeated: bool) -> bool:
-        """End the experiment if the sensor is silent or frozen; return True if so."""
+    def _passes_limit(self, t: float, y: float) -> Ended | None:
+        """Return the end of the experiment if the last sample passes a limit."""
+        p, facts = self.parameters, self.facts
+        low, high = p.measurement_min, p.measurement_max
+        if not low <= y <= high:
+            why = Code.OUTSIDE_LIMITS(value=y, time=t, low=low, high=high)
+            return Ended(State.ABORTED, why)
+        away = abs(y - facts.setpoint) if p.max_deviation > 0.0 else 0.0
+        if away > p.max_deviation:
+            why = Code.TOO_FAR(value=y, time=t, away=away, most=p.max_deviation)
+            return Ended(State.ABORTED, why)
+        if 0.0 < p.max_duration < t:
+            return failed(Code.MAX_DURATION(limit=p.max_duration, where=self._phase.where))
+        if (seen := self._trace.seen[-1]) > self._phase.latest:
+            return failed(Code.TOO_LONG(time=seen, where=self._phase.where))
+        return None
+
+    def _is_dead(self, t: float, y: float, *, repeated: bool) -> Ended | None:
+        """Return the end of the experiment if the sensor is silent or frozen."""
         if repeated:
             longest = max((cycle.period for cycle in self.cycles), default=math.inf)
-            if self._silence.repeat(t, longest_cycle=longest):
-                self.end(
-                    State.FAILED,
-                    f"the measurement does not respond any more: silent for "
-                    f"{self._silence.silence:.3g} s, much longer than before, "
-                    f"{self._where()}; check the sensor",
-                )
-            return self.finished
+            if not self._silence.repeat(t, longest_cycle=longest):
+                return None
+            silence, where = self._silence.silence, self._phase.where
+            return failed(Code.SILENT_TOO_LONG(silence=silence, where=where))
         self._silence.hear(t, relaying=self.state is State.RELAY)
         resting = self.state is State.SETTLING
-        if self._frozen.add(y, at_rest=resting, in_cycles=bool(self.cycles)):
-            self.end(
-                State.FAILED,
-                f"the sensor is frozen: its last {self._frozen.run} samples are all {y:g}, "
-                f"{self._where()}; check the sensor",
-            )
-        return self.finished
+        if not self._frozen.add(y, at_rest=resting, in_cycles=bool(self.cycles)):
+            return None
+        run, where = self._frozen.run, self._phase.where
+        return failed(Code.FROZEN_SENSOR(samples=run, value=y, where=where))
 
-    def _deviation(self, y: float) -> float:
-        settings = self.settings
-        return abs(y - settings.setpoint) if settings is not None else 0.0
+
+def _reason(reason: Reason | str) -> Reason:
+    return other(reason) if isinstance(reason, str) else reason

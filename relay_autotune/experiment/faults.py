@@ -3,7 +3,7 @@
 
 """What ends an experiment: faults of the sensor, of its clock and of the process.
 
-A fault has a sentence with what was found. The last part is the command after the end.
+Each watch takes samples and returns a reason to end. The last part is the command after the end.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from relay_autotune.arrays import FloatArray
+from relay_autotune.reasons import Code, Reason, Value
 from relay_autotune.record.record import Cycle, RelaySettings
 
 # If less than this part of the samples at rest equals the one before, the noise changes every
@@ -96,8 +97,8 @@ class ClockWatch:
         """Change of the difference of the clocks since the start [s]."""
         return 0.0 if math.isnan(self._begin) else self._reference - self._begin
 
-    def add(self, source: float, receive: float) -> str:
-        """Take the two times of a sample; return a sentence if a clock has stepped, else "".
+    def add(self, source: float, receive: float) -> Reason | None:
+        """Take the two times of a sample; return a reason if a clock has stepped.
 
         :param source: when it was taken, on the sensor's clock [s].
         :param receive: when it arrived, on our clock [s].
@@ -106,26 +107,23 @@ class ClockWatch:
         if len(self._first) < _STEP_SAMPLES:
             self._first.append(difference)
             self._begin = self._reference = min(self._first)
-            return ""
+            return None
         moved = difference - self._reference
         if moved > _STEP_LEAST:
             if self._late == 0:
                 self._late_since = receive
             self._late += 1
             lasting = receive - self._late_since > _STEP_LASTS and self._late >= _STEP_SAMPLES
-            return self._said(difference) if lasting else ""
+            return self._stepped(difference) if lasting else None
         self._late = 0
         if moved < -_STEP_LEAST:
-            return self._said(difference)
+            return self._stepped(difference)
         # A drift is followed, a step is not.
         self._reference += moved if moved < 0.0 else _FOLLOWED * moved
-        return ""
+        return None
 
-    def _said(self, difference: float) -> str:
-        return (
-            f"a clock has stepped: receive minus source time went from {self._reference:.4g} s to "
-            f"{difference:.4g} s; stop what sets the clocks, or give sample_period"
-        )
+    def _stepped(self, difference: float) -> Reason:
+        return Code.CLOCK_STEPPED(before=self._reference, now=difference)
 
 
 # Numbers beyond this are no measurements, and their squares may overflow.
@@ -141,7 +139,9 @@ class SampleCheck:
         self._samples = 0
         self._repeats = 0
 
-    def problem(self, time: float, measurement: float, last: float, origin: float) -> str | None:
+    def problem(
+        self, time: float, measurement: float, last: float, origin: float
+    ) -> Reason | None:
         """Take a sample; return why it cannot be used, None if it can.
 
         :param time: its instant [s].
@@ -152,12 +152,9 @@ class SampleCheck:
         count = self._samples
         self._samples += 1
         if not -_LARGEST < measurement < _LARGEST:
-            return (
-                f"the measurement after {count} samples is {measurement:g}, expected a "
-                f"finite number: check the sensor"
-            )
+            return Code.BAD_MEASUREMENT(samples=count, value=measurement)
         if not -_LARGEST < time < _LARGEST:
-            return f"the time after {count} samples is {time:g} s, expected a finite number"
+            return Code.BAD_TIME(samples=count, time=time)
         if last == -math.inf:
             return None
         t = float(time) - origin
@@ -165,17 +162,11 @@ class SampleCheck:
             self._repeats = 0
             return None
         if t < last:
-            return (
-                f"time went backwards, from {last:g} s to {t:g} s after the first sample: check "
-                f"the clock that stamps the measurement"
-            )
+            return Code.TIME_BACKWARDS(before=last, time=t)
         self._repeats += 1
         if self._repeats < _LONGEST_REPEAT:
             return None
-        return (
-            f"{_LONGEST_REPEAT} samples carry the same time, {t:g} s after the first: check the "
-            f"clock that stamps the measurement"
-        )
+        return Code.TIME_REPEATS(samples=_LONGEST_REPEAT, time=t)
 
 
 # A silence is too long if it exceeds a multiple of the longest one while the relay switched, a
@@ -302,12 +293,6 @@ _LEVEL = 0.03
 # A measurement has not come back if it is within this part of its way from its extreme.
 _BACK = 0.1
 
-NO_ANSWER = (
-    "it does not respond: it has stood still since the command last changed; check the sensor, "
-    "and that the actuator follows"
-)
-"""Sentence for a measurement that did not move."""
-
 
 class RunawayWatch:
     """Recognise exponential growth: an unstable process that the relay cannot hold.
@@ -354,17 +339,20 @@ class RunawayWatch:
         return last <= _NO_LONGER * (before - begin)
 
 
-def why_no_return(time: FloatArray, towards: FloatArray, noise_std: float) -> str:
-    """Return what the measurement did while the relay stayed at one level, and a remedy.
+def why_no_return(
+    time: FloatArray, towards: FloatArray, noise_std: float, /, **facts: Value
+) -> Reason:
+    """Return what the measurement did while the relay stayed at one level.
 
     :param time: instants of the samples of that stay [s], shape (n,).
     :param towards: the samples, times 1 if the relay pushed upwards and -1 if downwards [y],
         shape (n,).
     :param noise_std: standard deviation of the noise [y].
+    :param facts: for the sentence of the reason.
     """
     thirds = [part for part in _thirds(time, towards) if len(part)]
     if len(thirds) < 3:
-        return "there are too few samples to say why: check the sensor's rate"
+        return Code.TOO_FEW_SAMPLES(**facts)
     first, second, third = (float(part.mean()) for part in thirds)
     whole = float(towards.max() - towards.min())
     still = 3.0 * noise_std / min(len(part) for part in thirds) ** 0.5
@@ -373,26 +361,11 @@ def why_no_return(time: FloatArray, towards: FloatArray, noise_std: float) -> st
     way_back = float(towards[-1] - towards.min())
     away = way_back <= max(_BACK * whole, level, 6.0 * noise_std)
     if away and third - float(towards[0]) < -level:
-        faster = " faster and faster" if second - third > first - second > 0.0 else ""
+        if second - third > first - second > 0.0:
+            facts["faster"] = "faster and faster"
         rests = abs(third - second) <= level
-        other = (
-            "a load has come that the relay cannot compensate"
-            if rests
-            else "the process is unstable and the amplitude too small to hold it"
-        )
-        return (
-            f"it moved away{faster}, against the relay's push: process_gain_sign may be wrong, "
-            f"the process was not at rest at the start, or {other}"
-        )
-    if abs(third - second) <= level:
-        return (
-            "the response saturates before the relay's band: the amplitude may be too small for "
-            "the hysteresis or the set-point, a load may have come, or the actuator is at its end"
-        )
-    return (
-        "it moves towards the band, but too slowly for what was seen before: give a larger "
-        "amplitude or max_half_cycle, and let the process rest before the start"
-    )
+        return (Code.MOVED_AWAY_LOAD if rests else Code.MOVED_AWAY_UNSTABLE)(**facts)
+    return (Code.SATURATED if abs(third - second) <= level else Code.TOO_SLOW)(**facts)
 
 
 def has_moved(measurement: FloatArray) -> bool:
@@ -430,21 +403,17 @@ TELL = 50
 """Number of samples for this decision before there are enough cycles."""
 
 
-def why_noise_alone(measurement: FloatArray, noise_std: float, after: str) -> str:
-    """Return why samples are no oscillation, "" if they may be one.
+def why_noise_alone(measurement: FloatArray, noise_std: float, cycles: int) -> Reason | None:
+    """Return why samples are no oscillation, None if they may be one.
 
     :param measurement: the samples [y], shape (n,).
     :param noise_std: standard deviation of the noise at rest [y].
-    :param after: number of cycles, in words.
+    :param cycles: their number so far.
     """
     spread = float(measurement.std())
     if spread >= _ABOVE_NOISE * noise_std:
-        return ""
-    return (
-        f"no oscillation after {after}, only noise: the measurement's standard deviation is "
-        f"{spread:.3g}, that of its noise at rest {noise_std:.3g}; give a larger amplitude, or "
-        "check that the actuator follows its command"
-    )
+        return None
+    return Code.NOISE_ALONE(cycles=cycles, spread=spread, noise=noise_std)
 
 
 # Half the ultimate gain: the quarter-decay margin of Ziegler and Nichols for proportional control.

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from relay_autotune.errors import ParameterError
 from relay_autotune.quantities import check, declared, quantity
+from relay_autotune.reasons import Code, Reason
 
 # An amplitude that is not given starts at this part of the command's range.
 FIRST_SHARE = 0.01
@@ -110,8 +111,8 @@ class ExperimentParameters:
         first = FIRST_SHARE * (self.command_max - self.command_min)
         return first if abs(self.bias) < first else 1.5 * abs(self.bias)
 
-    def why_one_way(self, baseline: float) -> str:
-        """Return why a baseline leaves the relay one way only, and what to do; empty: both.
+    def why_one_way(self, baseline: float) -> Reason | None:
+        """Return why a baseline leaves the relay one way only; None: it can go both.
 
         No relay oscillates about an end of the actuator: with one level the process already is
         where it goes with the other.
@@ -126,13 +127,8 @@ class ExperimentParameters:
         ):
             if room == 0.0 or (self.finds_amplitude and 0.0 < room < step):
                 where = "too near to" if room else "at"
-                return (
-                    f"the baseline, {baseline:g}, is {where} the actuator's end, {name} "
-                    f"{limit:g}: from there the command can go one way only; at which command "
-                    f"does the process rest at its working point? Send that, wait until it rests, "
-                    f"and give it as the baseline"
-                )
-        return ""
+                return Code.ONE_WAY(baseline=baseline, where=where, limit=name, value=limit)
+        return None
 
     def validate(self, baseline: float | None = None) -> None:
         """Refuse values out of range and values that contradict each other.

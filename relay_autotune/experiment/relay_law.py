@@ -13,6 +13,7 @@ import math
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.experiment.parameters import FIRST_SHARE, ExperimentParameters
+from relay_autotune.reasons import Code, Reason
 
 
 class Relay:
@@ -330,8 +331,8 @@ class Levels:
         first = self._first_clear
         return first is not None and self.amplitude >= _GROWN * first[0]
 
-    def why_clipped(self, half_swing: float, *, settled: bool) -> str:
-        """Return why the actuator must be at its ends, or "".
+    def why_clipped(self, half_swing: float, *, settled: bool) -> Reason | None:
+        """Return why the actuator must be at its ends, None if it need not.
 
         A response that is clear of noise must grow with the levels.
 
@@ -340,15 +341,17 @@ class Levels:
             the square root of the growth of the levels.
         """
         if self._first_clear is None or not self.grew_enough:
-            return ""
+            return None
         amplitude, swing, low, high = self._first_clear
         if half_swing >= swing * (math.sqrt(self.amplitude / amplitude) if settled else _CLIPPED):
-            return ""
-        return (
-            f"the actuator is clipped: the amplitude grew from {amplitude:.3g} to "
-            f"{self.amplitude:.3g}, and half the swing of the measurement from {swing:.3g} to "
-            f"{half_swing:.3g} only; give its true ends for command_min and command_max, or an "
-            f"amplitude with which it stays between {low:.3g} and {high:.3g}"
+            return None
+        return Code.CLIPPED(
+            before=amplitude,
+            now=self.amplitude,
+            swing_before=swing,
+            swing=half_swing,
+            low=low,
+            high=high,
         )
 
     def growth_for(self, half_swing: float, least: float) -> float:

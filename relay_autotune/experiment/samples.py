@@ -1,13 +1,14 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The samples of a running experiment, and what its parts know from them."""
+"""What the states of a running experiment share: samples, facts, and how a state ends."""
 
 from __future__ import annotations
 
 import enum
 import math
 from array import array
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -15,8 +16,8 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.relay_law import Levels
-from relay_autotune.experiment.settling import NOT_SETTLED
-from relay_autotune.record.record import Cycle, RelaySettings
+from relay_autotune.experiment.settling import NOT_SETTLED, RestState
+from relay_autotune.reasons import Reason
 
 # An interval counts at most this many times the mean of the intervals before it: a gap in the
 # samples, or a step of their clock, says nothing about the process. The pauses of a sensor that
@@ -86,10 +87,6 @@ class Samples:
         return time, measurement, command
 
 
-# If the levels started at a quarter, the swings are compared after this many cycles.
-_TRIED = 2
-
-
 class State(enum.IntEnum):
     """The state of an experiment."""
 
@@ -102,103 +99,101 @@ class State(enum.IntEnum):
     FAILED = 7
 
 
-class Run:
-    """What is known of a running experiment: each of its parts reads it and adds to it.
+@dataclass(frozen=True)
+class Facts:
+    """What the states have found, each for those after it."""
+
+    rest: RestState = NOT_SETTLED
+    """The measurement at rest at the baseline."""
+    settled_at: float = math.nan
+    """When it was known, gaps not counted [s]."""
+    kicked_at: float = math.nan
+    """Time of the kick from the first sample on [s]; NaN before."""
+    setpoint: float = math.nan
+    """Middle of the relay's band [y]; NaN until the measurement has settled."""
+    hysteresis: float = math.nan
+    """Its half width [y]."""
+    sign: int = 0
+    """Sign of the process gain, 1 or -1 as given or found; 0 while unknown."""
+    side: int = 0
+    """Side of the rest on which the response began, 1 or -1; 0 before."""
+    dead_time_seen: float = math.nan
+    """Time from the kick to the last sample before the response [s]; NaN until it is seen.
+
+    Without noise the dead time lies between this and one sample interval more. With noise this
+    time is longer: the response must first leave the noise band."""
+    response_time: float = math.nan
+    """Time from the kick to the first sample of the response [s]; NaN until it is seen."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What every state of an experiment has.
 
     :param parameters: the user's parameters, valid.
     :param baseline: command of the operating point [u].
-    :param from_small: True: a given amplitude begins at a quarter of that.
+    :param until_converged: False: agreement of the cycles does not end it.
     """
 
-    def __init__(
-        self, parameters: ExperimentParameters, baseline: float, *, from_small: bool = False
-    ) -> None:
-        self.parameters = parameters
-        self.baseline = float(baseline)
-        self.levels = Levels(parameters, self.baseline, from_small=from_small)
-        """The levels of the relay."""
-        self.state = State.SETTLING
-        """The present state."""
-        self.why_ended = ""
-        """Why it ended, a sentence for people without the notes; empty before."""
-        self.trace = Samples()
-        """The samples so far; each is appended before it is answered."""
-        self.rest = NOT_SETTLED
-        """The measurement at rest at the baseline."""
-        self.setpoint = self.hysteresis = math.nan
-        """Middle and half width of the relay's band [y]; NaN until the measurement has settled."""
-        self.process_gain_sign = parameters.process_gain_sign
-        """1 or -1 as given or found; 0 while unknown."""
-        self.kicked_at = math.nan
-        """Time of the kick from the first sample on [s]; NaN before."""
-        self.dead_time_seen = math.nan
-        """Time from the kick to the last sample before the response [s]; NaN until it is seen.
-
-        Without noise the dead time lies between this and one sample interval more. With noise
-        this time is longer: the response must first leave the noise band."""
-        self.response_time = math.nan
-        """Time from the kick to the first sample of the response [s]; NaN until it is seen."""
-        self.cycles: tuple[Cycle, ...] = ()
-        """The whole cycles so far."""
-        self.cycle_start: tuple[int, ...] = ()
-        """Index of the first sample of each cycle, as in a record."""
-        self.switches = 0
-        """Number of switches of the relay so far; two of them are a half cycle."""
-        self.notes: list[str] = []
-        """Sentences that follow the reason of the end."""
-
-    def end(self, state: State, reason: str) -> float:
-        """End the experiment and return the safe command.
-
-        :param state: COMPLETED, ABORTED or FAILED.
-        :param reason: why, a sentence for people.
-        """
-        self.state, self.why_ended = state, reason
-        return self.baseline
+    parameters: ExperimentParameters
+    baseline: float
+    until_converged: bool
+    levels: Levels
+    """The levels of the relay."""
+    trace: Samples
+    """The samples so far; each is appended before it is answered."""
+    notes: list[Reason]
+    """What else is to be known of the experiment, in the order in which it was found."""
 
     @property
-    def settings(self) -> RelaySettings | None:
-        """The relay's settings; None until the measurement has settled.
+    def now(self) -> tuple[float, float]:
+        """Time without gaps [s] and measurement [y] of the last sample."""
+        return self.trace.seen[-1], self.trace.measurement[-1]
 
-        While the sign of the process gain is not known, ``reverse_acting`` is False.
-        """
-        if not self.rest.samples:
-            return None
-        return RelaySettings(
-            setpoint=self.setpoint,
-            baseline=self.baseline,
-            amplitude=self.levels.amplitude,
-            bias=self.levels.bias,
-            hysteresis=self.hysteresis,
-            extra_delay=self.parameters.extra_delay,
-            sample_period=self.parameters.sample_period,
-            reverse_acting=self.process_gain_sign < 0,
-        )
+    def level(self, *, is_high: bool) -> float:
+        """Return a level of the relay [u]."""
+        return self.levels.high if is_high else self.levels.low
 
-    @property
-    def is_tried(self) -> bool:
-        """True unless the levels began small and it is not known yet whether the process follows.
 
-        Until then the cycles may be those of an actuator that is at its ends.
-        """
-        return not self.levels.from_small or len(self.cycles) >= _TRIED
+class Event(enum.Enum):
+    """What ends a state."""
 
-    @property
-    def noise_std(self) -> float:
-        """Standard deviation of the measurement at rest [y]; NaN until it has settled."""
-        return self.rest.noise_std
+    STEADY = enum.auto()
+    """The measurement is at rest."""
+    RESPONSE = enum.auto()
+    """The process has responded to the kick, and the sign of its gain is given."""
+    UNSIGNED_RESPONSE = enum.auto()
+    """The process has responded, and the sign is not known."""
+    DIRECTION = enum.auto()
+    """The sign has been found."""
+    NO_DIRECTION = enum.auto()
+    """Nothing is left of the response."""
 
-    @property
-    def rest_measurement(self) -> float:
-        """Mean measurement at rest at the baseline [y]; NaN until it has settled."""
-        return self.rest.mean
 
-    @property
-    def cycle_count(self) -> int:
-        """Number of whole cycles so far."""
-        return len(self.cycles)
+@dataclass(frozen=True)
+class Left:
+    """A state has ended by an event, with what is known then."""
 
-    @property
-    def counted(self) -> str:
-        """The number of whole cycles in words."""
-        return f"{len(self.cycles)} whole cycle{'' if len(self.cycles) == 1 else 's'}"
+    event: Event
+    facts: Facts
+
+
+@dataclass(frozen=True)
+class Ended:
+    """The experiment has ended.
+
+    :param state: COMPLETED, ABORTED or FAILED.
+    :param why: the reason.
+    """
+
+    state: State
+    why: Reason
+
+
+Answer = float | Left | Ended
+"""What a state makes of a sample: a command [u], or its end."""
+
+
+def failed(why: Reason) -> Ended:
+    """Return the end of an experiment that has failed."""
+    return Ended(State.FAILED, why)

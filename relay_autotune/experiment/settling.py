@@ -38,9 +38,6 @@ _MOVED = 3.0
 # Relative to the measurement: what rounding in a sensor or a simulation may add up to.
 _UNSEEN = 1e-9
 
-NO_REST_AT = "the measurement rested at"
-"""How the reason begins if the process does not rest at the baseline."""
-
 
 @dataclass(frozen=True)
 class RestState:
@@ -155,15 +152,20 @@ class RestWatch:
         self._since = 0
         self._outside = 0
 
-    def leaves(self, measurement: float) -> str:
-        """Take a sample [y]; return where the measurement rested and is, empty while it rests."""
+    @property
+    def rested_at(self) -> float:
+        """Mean of the measurements before [y]; NaN while they are too few."""
+        return self._rest.mean
+
+    def leaves(self, measurement: float) -> bool:
+        """Take a sample [y]; return True if the measurement has left its rest."""
         step = abs(measurement - self._last)
         if step > 0.0:
             self._resolution = min(self._resolution, step)
         self._last = measurement
         if len(self._before) < CONSTANT_SAMPLES:
             self._before.append(measurement)
-            return ""
+            return False
         if not self._rest.samples:
             self._learn()
         self._since += 1
@@ -171,15 +173,13 @@ class RestWatch:
         away = measurement - rest.mean
         if abs(away) <= self._allowed(0.5 * (n - 1) + self._since):
             self._outside = 0
-            return ""
+            return False
         side = 1 if away > 0.0 else -1
         self._outside = side * (max(side * self._outside, 0) + 1)
-        if abs(self._outside) < _OUTSIDE_SAMPLES:
-            return ""
-        return f"{NO_REST_AT} {rest.mean:.6g} y and is at {measurement:.6g} y"
+        return abs(self._outside) >= _OUTSIDE_SAMPLES
 
-    def moved_to(self, mean: float) -> str:
-        """Return how far the measurement has gone in the settling, empty where it is no distance.
+    def has_moved_to(self, mean: float) -> bool:
+        """Return True if the measurement has gone a distance in the settling.
 
         A drift that the samples before cannot exclude is no reason to end the tune, but to tell.
 
@@ -188,9 +188,7 @@ class RestWatch:
         rest = self._rest
         steps = self._resolution if math.isfinite(self._resolution) else 0.0
         least = max(_OUTSIDE_STD * rest.noise_std, _OUTSIDE_STEPS * steps, _UNSEEN * abs(mean))
-        if not rest.samples or abs(mean - rest.mean) <= least:
-            return ""
-        return f"{NO_REST_AT} {rest.mean:.6g} y before the first command, and at {mean:.6g} y"
+        return bool(rest.samples) and abs(mean - rest.mean) > least
 
     def _learn(self) -> None:
         y = np.array(self._before)

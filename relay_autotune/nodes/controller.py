@@ -50,6 +50,7 @@ from relay_autotune.nodes.parameters import ask_before_changes, declare, merged,
 from relay_autotune.nodes.results import ResultCheck, why_doubtful
 from relay_autotune.nodes.verifier import Predictors, Verifiable, Verifier
 from relay_autotune.nodes.watch import Following, Repeater, require_own_time
+from relay_autotune.reasons import Reason
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage
@@ -503,12 +504,12 @@ class ControllerNode(ServedNode):
 
     # The end.
 
-    def end(self, reason: str) -> None:
+    def end(self, reason: Reason) -> None:
         """Undo the steps of a verification, and leave a safe command and trusted gains."""
         rested = self._verifier.rested_at
         at_work = self._verifier.is_running or self._keeper.is_at_work
         self._ending = True
-        self._verifier.interrupt(reason)
+        self._verifier.interrupt(str(reason))
         if self._remote is not None:
             self._remote.wait_for_setpoint(ACKNOWLEDGE)
         elif self._commanded and not self._held:

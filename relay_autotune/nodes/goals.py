@@ -13,9 +13,11 @@ from rclpy.action import ActionServer, CancelResponse
 from rclpy.node import Node
 
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.exchange.messages import fill_reason
 from relay_autotune.experiment.experiment import RelayExperiment, State
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
+from relay_autotune.reasons import Reason
 from relay_autotune.text import TOLD_EVERY
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import TransferFunction
@@ -135,6 +137,16 @@ def conclude(goal: Any, result: Any, *, succeeded: bool) -> None:
     goal.execute(finish)
 
 
+def refused(reason: Reason) -> StartTune.Response:
+    """Return the answer to a start that is not possible.
+
+    :param reason: why not.
+    """
+    answer = StartTune.Response(reason=str(reason))
+    fill_reason(answer.why, reason)
+    return answer
+
+
 class TuneAction(OneGoal):
     """Serve the action.
 
@@ -171,7 +183,12 @@ class TuneAction(OneGoal):
             self.running = goal
             self._forget(started.experiment_id)
             return
-        result = Tune.Result(reason=started.reason, checks=started.checks)
+        result = Tune.Result(
+            reason=started.reason,
+            why=started.why,
+            checks=started.checks,
+            refusals=started.refusals,
+        )
         conclude(goal, result, succeeded=started.accepted)
 
     def tell(self, experiment: RelayExperiment, status: str) -> None:
@@ -235,10 +252,14 @@ class TuneAction(OneGoal):
         result.experiment = summary
         result.bag = bag
         result.outcome = summary.outcome
+        result.why = summary.why
         result.reason = "; ".join(filter(None, (summary.reason, missing)))
         given = bool(result.gains.experiment_id)
         told = result.gains if given else result.transfer_function
         result.verdict = told.verdict if given else Tune.Result.VERDICT_NONE
         result.verdict_reason = told.verdict_reason or ("" if given else result.reason)
+        result.verdict_why = told.verdict_why
+        if not (told.verdict_reason or given):
+            result.verdict_why = result.why
         self.running = None
         conclude(goal, result, succeeded=summary.outcome == Tune.Result.COMPLETED)

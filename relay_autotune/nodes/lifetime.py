@@ -52,6 +52,7 @@ from rclpy.task import Future
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.parameters import unknown_parameters
 from relay_autotune.quantities import Quantity
+from relay_autotune.reasons import NONE, Code, Reason
 from relay_autotune.text import visible
 
 # Messages further apart than this take the ordinary path [s].
@@ -60,9 +61,6 @@ CLOSE = 0.002
 LOOK_AROUND = 0.005
 # After this time without a callback all work is done; it also lets the last message leave [s].
 _NOTHING_MORE = 0.02
-
-NODE_FAILED = "the node failed"
-"""How the reason of an end begins if the cause is a defect of the node."""
 
 
 class Executor(SingleThreadedExecutor):
@@ -270,7 +268,7 @@ class ServedNode(Node):
             raise found
         return found
 
-    def end(self, reason: str) -> None:
+    def end(self, reason: Reason) -> None:
         """Bring the loop to a safe state first, then finish open work.
 
         :param reason: why the process ends, for people.
@@ -451,15 +449,15 @@ def _serve(node: ServedNode, signals: _Signals) -> int:
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 50)
-    status, reason = 0, ""
+    status, reason = 0, NONE
     try:
         more = False
         while not signals.came:
             busy = executor.turn(0.0 if more else None)
             more = node.work(idle=not busy)
-        reason = f"the node was stopped by {signal_name(signals.came[0])}"
+        reason = Code.SIGNAL(signal=signal_name(signals.came[0]))
     except Exception as error:
-        status, reason = 1, f"{NODE_FAILED}: {_where(error)}"
+        status, reason = 1, Code.NODE_FAILED(error=_where(error))
     # The safe command goes out before the reason is logged.
     for end in (partial(node.end, reason), partial(executor.finish, _FINISH_WITHIN)):
         try:
@@ -468,7 +466,7 @@ def _serve(node: ServedNode, signals: _Signals) -> int:
             status = 1
             node.get_logger().fatal(f"could not end in order: {_where(error)}")
     if status:
-        node.get_logger().fatal(reason)
+        node.get_logger().fatal(str(reason))
     signals.end()
     executor.shutdown(timeout_sec=0.0)
     return status

@@ -28,6 +28,7 @@ from relay_autotune.nodes import quality, watch
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.nodes.live_types import CommandMessage, Reader
 from relay_autotune.nodes.results import SIGNS_OF_LIFE
+from relay_autotune.reasons import Code, Reason
 from relay_autotune_msgs.msg import PidGains, RelayCycle, TransferFunction
 from relay_autotune_msgs.msg import RelayExperiment as ExperimentMessage
 
@@ -37,6 +38,7 @@ REPEAT_SAFE = Duration(seconds=0.01)
 REPEATS = 15
 # Number of latched cycles for late subscribers; max_cycles at the node's start if that is more.
 CYCLES_KEPT = 100
+_REMAP = "remap the controller's output to controller_command, or give path takeover"
 
 
 class CommandPublisher:
@@ -269,7 +271,7 @@ class LoopSupervisor:
     :param stop: ends a running tune; takes the reason.
     """
 
-    def __init__(self, node: Any, ends: RelayTopics, stop: Callable[[str], None]) -> None:
+    def __init__(self, node: Any, ends: RelayTopics, stop: Callable[[Reason], None]) -> None:
         self._node = node
         self._ends = ends
         self._takeover = takeover = self._value("path") == "takeover"
@@ -341,27 +343,17 @@ class LoopSupervisor:
         if several := self._several():
             raise NotReadyError(several)
         if self._ends.setpoint is not None and not self.is_connected:
-            raise NotReadyError(
-                "relay_on is setpoint, but no controller_command comes: connect the controller of "
-                "the present loop, with path passthrough, or give controller_command_field where "
-                "the messages of the measurement have it"
-            )
+            raise NotReadyError(Code.NO_CONTROLLER())
         if self._takeover:
             if self._driven and self.handover.age <= self._value("controller_timeout"):
-                raise NotReadyError(
-                    f"{self._topic} is being commanded by another node; have the controller hold "
-                    "or track before the start"
-                )
+                raise NotReadyError(Code.BUSY_COMMAND(topic=self._topic))
             return
         problem = watch.second_publisher(self._node, self._topic)
-        if problem:
-            raise NotReadyError(
-                f"{problem}; remap the controller's output to controller_command, or give path "
-                "takeover"
-            )
+        if problem is not None:
+            raise NotReadyError(problem.plus(remap=_REMAP))
 
-    def _several(self) -> str:
-        """Return a sentence on a second sensor, controller or relay_node, or ""."""
+    def _several(self) -> Reason | None:
+        """Return a reason if there is a second sensor, controller or relay_node."""
         several = watch.second_source(self._node, self._ends.measurement)
         if not several and not self._takeover and not self._ends.is_reported:
             several = watch.second_source(self._node, self._controller)
@@ -378,7 +370,7 @@ class LoopSupervisor:
         self.commanded = math.nan
         if self._ends.setpoint is None:
             self.handover.take_over()
-        checks: list[Callable[[], str]] = [watch.Overtime.of(experiment, self._node)]
+        checks: list[watch.Check] = [watch.Overtime.of(experiment, self._node)]
         of_graph = [self._several]
         if not self._takeover:
             of_graph.append(partial(watch.second_publisher, self._node, self._topic))
@@ -386,9 +378,8 @@ class LoopSupervisor:
             timeout = self._value("controller_timeout")
             reported = self._ends.is_reported
             topic = (self._ends.measurement if reported else self._controller).topic_name
-            checks.append(
-                watch.silence(f"no command on {topic}", timeout, lambda: self.handover.age)
-            )
+            silent = partial(Code.SILENT_CONTROLLER, topic=topic)
+            checks.append(watch.silence(silent, timeout, lambda: self.handover.age))
         timeout = self._value("feedback_timeout")
         self._follow = None
         if self._ends.setpoint is None:
@@ -398,7 +389,7 @@ class LoopSupervisor:
             self._follow = watch.FollowWatch(self._tolerance(experiment), timeout)
             checks.append(
                 watch.silence(
-                    "no command_feedback",
+                    Code.SILENT_FEEDBACK,
                     2.0 * timeout,
                     lambda: time.monotonic() - self._feedback_at,
                 )
@@ -467,15 +458,13 @@ class LoopSupervisor:
         try:
             command = self._messages.value(message)
         except FieldError as error:
-            self._stop(f"another node commanded on {self._topic} during the tune: {error}")
+            self._stop(Code.FOREIGN_COMMAND(topic=self._topic, unread=str(error)))
             return
         if command in self._own:
             return
         if self._experiment is not None:
-            self._stop(
-                f"another node commanded {command:g} on {self._topic} during the tune: the "
-                "controller must hold or track"
-            )
+            must = "hold or track"
+            self._stop(Code.FOREIGN_COMMAND(topic=self._topic, command=command, hold=must))
         # A foreign command means that its sender controls the loop again.
         self._driven = True
         self.handover.note(command)
@@ -484,7 +473,7 @@ class LoopSupervisor:
         messages = self._messages
         messages.take_others(message)
         if messages.why_unknown:
-            self._stop(f"the other elements of the command are not known: {messages.why_unknown}")
+            self._stop(Code.OTHERS_UNKNOWN(why=messages.why_unknown))
 
     def _send_again(self) -> None:
         """Send the last command again if none has gone out since the last look."""
@@ -499,10 +488,8 @@ class LoopSupervisor:
         if self._follow is None or math.isnan(self.commanded):
             return
         if self._follow.add(self._feedback_at, self.commanded, message.data):
-            self._stop(
-                f"the actuator does not follow: it is told {self.commanded:g} and says that it is "
-                f"at {message.data:g}{self._follow.rail}"
-            )
+            at = {"command": self.commanded, "position": message.data, **self._follow.rail}
+            self._stop(Code.NOT_FOLLOWING(**at))
 
     def _look(self) -> None:
         if not self.is_driven:

@@ -19,18 +19,23 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from relay_autotune.errors import NotReadyError, RelayAutotuneError
+from relay_autotune.exchange.messages import fill_reason
 from relay_autotune.experiment.experiment import SafePolicy
 from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.procedure import SETTLING_LIMIT, SMALL_CYCLES, how_long
+from relay_autotune.experiment.phases import SETTLING_LIMIT, SMALL_CYCLES, how_long
 from relay_autotune.experiment.relay_law import Levels
+from relay_autotune.nodes.goals import refused
 from relay_autotune.nodes.loop_ends import LoopSupervisor, RelayTopics
 from relay_autotune.nodes.parameters import merged, values_of
 from relay_autotune.nodes.quality import described, who, why_no_publisher, why_no_subscriber
 from relay_autotune.nodes.tables import TUNE_PARAMETERS
 from relay_autotune.nodes.watch import LastSamples, Sensor, require_own_time
+from relay_autotune.reasons import Code, Reason, reason_of
 from relay_autotune.record.record import Cycle
 from relay_autotune.text import duration
+from relay_autotune_msgs.msg import Reason as ReasonMessage
+from relay_autotune_msgs.srv import StartTune
 
 _T = TypeVar("_T")
 
@@ -73,8 +78,10 @@ class Checklist:
 
     def __init__(self, node: str, *, stops: bool) -> None:
         self.checks: list[ChecklistLine] = []
-        self.refusal: RelayAutotuneError | None = None
-        """The first check that failed; None: all passed."""
+        self.refusals: list[Reason] = []
+        """Why each check that failed did so."""
+        self.noted: list[Reason] = []
+        """What is no reason not to start, but to be known."""
         self._node = node
         self.stops = stops
         """True if the first check that fails raises its error."""
@@ -97,14 +104,14 @@ class Checklist:
         except RelayAutotuneError as error:
             if self.stops:
                 raise
-            self.refusal = self.refusal or error
-            typed = error.typed if isinstance(error, NotReadyError) else ""
-            self._add(Mark.NO, name, str(error), typed)
+            why = reason_of(error)
+            self.refusals.append(why)
+            self._add(Mark.NO, name, str(why), why.typed)
             return None
         self._add(Mark.OK, name, found(value))
         return value
 
-    def tell(self, name: str, found: str, good: bool = True, typed: str = "") -> None:
+    def tell(self, name: str, found: str | Reason, good: bool = True, typed: str = "") -> None:
         """Add a line that is no reason not to start.
 
         :param name: what was looked at.
@@ -112,12 +119,28 @@ class Checklist:
         :param good: False: there is something to know.
         :param typed: parameter and value to set where it is not good.
         """
-        self._add(Mark.OK if good else Mark.NOTE, name, found, "" if good else typed)
+        if isinstance(found, Reason):
+            self.noted.append(found)
+        self._add(Mark.OK if good else Mark.NOTE, name, str(found), "" if good else typed)
 
     def _add(self, mark: Mark, name: str, found: str, typed: str = "") -> None:
         if typed:
             found += f"; type: ros2 param set {self._node} {typed}"
         self.checks.append(ChecklistLine(mark, name, found))
+
+
+def answer_of(checks: Checklist, **facts: Any) -> StartTune.Response:
+    """Return the answer to a dry run.
+
+    :param checks: all that were made.
+    :param facts: further fields; without them it is refused for the first check that failed.
+    """
+    answer = StartTune.Response(**facts) if facts else refused(checks.refusals[0])
+    answer.checks = checks.lines
+    for reason in (*checks.refusals, *checks.noted):
+        answer.refusals.append(ReasonMessage())
+        fill_reason(answer.refusals[-1], reason)
+    return answer
 
 
 @dataclass(frozen=True)
@@ -223,7 +246,7 @@ class Readiness:
         checks.tell("model", *_identifier_of(self._node, self._ends.gains.topic_name))
         checks.tell("expected", _expected(parameters, last))
         checks.tell("time", self.time_of(ready, parameters))
-        return ready if checks.refusal is None else None
+        return None if checks.refusals else ready
 
     def time_of(self, ready: Ready | None, parameters: ExperimentParameters) -> str:
         """Say how long a tune takes.
@@ -250,7 +273,7 @@ class Readiness:
         else:
             baseline = _baseline_from(values["baseline"], self._loop.mean_command(), held)
             if why := parameters.why_one_way(baseline):
-                raise NotReadyError(why, typed="baseline COMMAND")
+                raise NotReadyError(why)
         parameters.validate(baseline)
         policy = _policy_from(values, connected=self._loop.is_connected)
         # A feedback of the position, or the controller of a closed loop, also shows where the
@@ -264,13 +287,16 @@ class Readiness:
         """Refuse a start without measurements, with the reason as far as the graph shows it."""
         node, ends = self._node, self._ends
         if node.get_parameter("use_sim_time").value and node.get_clock().now().nanoseconds == 0:
-            raise NotReadyError("use_sim_time is true, but no time has come on /clock")
+            raise NotReadyError(Code.NO_CLOCK())
         if dead := self._sensor.why_dead():
             raise NotReadyError(dead)
         if (age := self._sensor.age) > timeout:
-            when = "yet" if math.isinf(age) else f"for {age:.3g} s"
             why = why_no_publisher(node, ends.measurement.topic_name, ends.reader.type_name)
-            raise NotReadyError(f"no measurement has come {when}: {why}")
+            raise NotReadyError(
+                Code.NO_MEASUREMENT_YET(why=why)
+                if math.isinf(age)
+                else Code.NO_MEASUREMENT_NOW(silence=age, why=why)
+            )
 
     def _heard(self) -> str:
         """Say who measures, and how."""
@@ -287,12 +313,9 @@ class Readiness:
         own = sum(s.topic_name == sent.topic_name for s in self._node.subscriptions)
         if sent.get_subscription_count() <= own:
             why = why_no_subscriber(self._node, sent.topic_name, messages.type_name)
-            raise NotReadyError(f"no command would arrive: {why}")
+            raise NotReadyError(Code.NO_SUBSCRIBER(why=why))
         if unknown := messages.why_unknown:
-            raise NotReadyError(
-                f"the other elements of the command are not known: {unknown}; publish there, or "
-                f"give command_message"
-            )
+            raise NotReadyError(Code.OTHERS_NOT_THERE(why=unknown))
 
     def _served(self) -> str:
         """Say who takes the commands."""
@@ -317,11 +340,7 @@ def _require_within_limits(parameters: ExperimentParameters, newest: float | Non
     if newest is None or low <= newest <= high:
         return
     limit, way = ("measurement_min", "lower") if newest < low else ("measurement_max", "higher")
-    raise NotReadyError(
-        f"the measurement is {newest:.6g}, outside of its limits, measurement_min {low:g} to "
-        f"measurement_max {high:g}: the first sample would end the tune; give a {way} {limit}",
-        typed=f"{limit} LIMIT",
-    )
+    raise NotReadyError(Code.BEYOND_LIMITS(value=newest, low=low, high=high, way=way, limit=limit))
 
 
 def _baseline_from(parameter: float, mean: float, held: float | None) -> float:
@@ -337,11 +356,7 @@ def _baseline_from(parameter: float, mean: float, held: float | None) -> float:
     if not math.isnan(mean):
         return mean
     if held is None:
-        raise NotReadyError(
-            "the baseline is not known: set the parameter baseline, or initial_command at the "
-            "node's start, to the command of the operating point",
-            typed="baseline COMMAND",
-        )
+        raise NotReadyError(Code.NO_BASELINE())
     return held
 
 
@@ -355,9 +370,7 @@ def _on_setpoint(parameters: ExperimentParameters) -> tuple[ExperimentParameters
     :raises NotReadyError: if the set-point is not given.
     """
     if math.isnan(parameters.setpoint):
-        raise NotReadyError(
-            "relay_on is setpoint, but setpoint is not given: set it to that of the present loop"
-        )
+        raise NotReadyError(Code.NO_SETPOINT())
     changed = replace(
         parameters,
         command_min=parameters.measurement_min,
@@ -377,9 +390,7 @@ def _policy_from(values: Mapping[str, Any], *, connected: bool) -> SafePolicy:
     safe = values["safe_command"]
     low, high = values["command_min"], values["command_max"]
     if not math.isnan(safe) and not low <= safe <= high:
-        raise NotReadyError(
-            f"safe_command is {safe:g}, expected from command_min {low:g} to command_max {high:g}"
-        )
+        raise NotReadyError(Code.UNSAFE_COMMAND(value=safe, low=low, high=high))
     kind, gain = values["process_type"], values["hold_gain"]
     if kind == "self_regulating":
         return SafePolicy(command=safe)
@@ -387,11 +398,7 @@ def _policy_from(values: Mapping[str, Any], *, connected: bool) -> SafePolicy:
         return SafePolicy(command=safe, give_back=True)
     if gain == 0.0 and not values["start_without_hold"]:
         drift = "drift away" if kind == "integrating" else "run away"
-        raise NotReadyError(
-            f"process_type is {kind}: at a constant command it would {drift} when a tune ends "
-            f"before its first cycle; connect controller_command, or give hold_gain, or set "
-            f"start_without_hold to true"
-        )
+        raise NotReadyError(Code.NO_HOLD(kind=kind, drift=drift))
     return SafePolicy(command=safe, hold=True, gain=gain)
 
 
@@ -405,10 +412,7 @@ def require_settable(node: Node, changes: Sequence[RosParameter], running: str) 
     """
     names = {entry.name for entry in TUNE_PARAMETERS}
     if running and any(change.name in names for change in changes):
-        raise NotReadyError(
-            f"parameters stay as they are while tune {running} runs; wait for its end or call "
-            f"{node.get_fully_qualified_name()}/abort"
-        )
+        raise NotReadyError(Code.FIXED_NOW(tune=running, node=node.get_fully_qualified_name()))
     values = merged(node, TUNE_PARAMETERS, changes)
     experiment = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}
     # A start request may still give the amplitude; then all is checked at the start.
@@ -417,7 +421,7 @@ def require_settable(node: Node, changes: Sequence[RosParameter], running: str) 
 
 
 # Each of these returns what was found, whether that is good, and what to set where it is not.
-_Told = tuple[str, bool, str]
+_Told = tuple[str | Reason, bool, str]
 
 
 def _rest_of(samples: LastSamples) -> _Told:
@@ -427,7 +431,7 @@ def _rest_of(samples: LastSamples) -> _Told:
     """
     rest = samples.rest()
     if rest is None:
-        return "not known yet, since few samples have come", False, ""
+        return Code.REST_UNKNOWN(), False, ""
     span = duration(rest.span)
     if rest.is_steady:
         return f"{rest.mean:.6g} y with noise of {rest.noise_std:.2g} y over {span}", True, ""
@@ -479,11 +483,7 @@ def _identifier_of(node: Node, topic: str) -> _Told:
         return f"from {found}", True, ""
     there = node.get_namespace()
     named = "" if there == "/" else f" --ros-args -r __ns:={there}"
-    found = (
-        f"no identifier_node: a recording alone, without model and gains; type: ros2 run "
-        f"relay_autotune identifier_node{named}"
-    )
-    return found, False, ""
+    return Code.NO_IDENTIFIER(where=named), False, ""
 
 
 def _expected(parameters: ExperimentParameters, last: tuple[float, Cycle] | None) -> str:

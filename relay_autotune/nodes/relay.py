@@ -20,17 +20,18 @@ from relay_autotune.errors import FieldError, NotReadyError, RelayAutotuneError
 from relay_autotune.exchange.messages import finding_from_message, set_stamp
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
-from relay_autotune.nodes.goals import Narrator, TuneAction, serve
+from relay_autotune.nodes.goals import Narrator, TuneAction, refused, serve
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.loop_ends import LoopSupervisor, RelayTopics
 from relay_autotune.nodes.parameters import ask_before_changes, declare, values_of
 from relay_autotune.nodes.quality import NO_REPEAT_AFTER, why_no_publisher
-from relay_autotune.nodes.readiness import Checklist, Readiness, Ready, require_settable
+from relay_autotune.nodes.readiness import Checklist, Readiness, Ready, answer_of, require_settable
 from relay_autotune.nodes.results import MODEL, OwnResults, said_by
 from relay_autotune.nodes.session import Recordings, Session, SetpointSession, reported_by
 from relay_autotune.nodes.tables import FIXED_PARAMETERS, TUNE_PARAMETERS
-from relay_autotune.nodes.watch import Sensor, losses
+from relay_autotune.nodes.watch import Sensor
+from relay_autotune.reasons import Code, Reason, reason_of
 from relay_autotune.record.record import Cycle, Outcome
 from relay_autotune.text import duration
 from relay_autotune_msgs.srv import StartTune
@@ -105,11 +106,12 @@ class RelayNode(ServedNode):
         try:
             value = self._value(message)
         except FieldError as error:
-            sensor.misread = f"the measurement on {self._topic} cannot be read: {error}"
+            why = str(error)
+            sensor.misread = Code.MISREAD(what="measurement", topic=self._topic, why=why)
             self._stop_now(sensor.misread)
             return
-        if sensor.misread:
-            sensor.misread = ""
+        if sensor.misread is not None:
+            sensor.misread = None
         if self._hear is not None:
             self._hear(value)
         if self._ahead:
@@ -131,9 +133,8 @@ class RelayNode(ServedNode):
             try:
                 self._loop.report(self._reported(message))
             except FieldError as error:
-                self._stop_now(
-                    f"the controller's command on {self._topic} cannot be read: {error}"
-                )
+                what, why = "controller's command", str(error)
+                self._stop_now(Code.MISREAD(what=what, topic=self._topic, why=why))
         self._sensor.count(info["publication_sequence_number"])
 
     def _on_silence(self, value: float, ago: float) -> None:
@@ -178,21 +179,17 @@ class RelayNode(ServedNode):
         checks = Checklist(self._name, stops=not dry_run)
         try:
             if self._session is not None:
-                raise NotReadyError(
-                    f"tune {self._session.id} is running; wait for its end or call "
-                    f"{self._name}/abort"
-                )
+                raise NotReadyError(Code.RUNNING(tune=self._session.id, node=self._name))
             ready = self._readiness.of(amplitude, checks, self._held, self._last_cycle)
         except RelayAutotuneError as error:
             self.get_logger().warning(f"start refused: {error}")
-            return StartTune.Response(reason=str(error))
-        lines = checks.lines if dry_run else []
+            return refused(reason_of(error))
         if ready is None:
-            return StartTune.Response(reason=str(checks.refusal), checks=lines)
+            return answer_of(checks)
         takes = self._readiness.time_of(ready, ready.parameters)
         if dry_run:
             reason = f"a tune could start: {ready.plan}; {takes}"
-            return StartTune.Response(accepted=True, reason=reason, checks=lines)
+            return answer_of(checks, accepted=True, reason=reason)
         identity, recorded = self._start(ready)
         reason = f"{ready.plan}; {recorded}; {takes}"
         self.get_logger().info(f"tune {identity} started: {reason}")
@@ -263,7 +260,7 @@ class RelayNode(ServedNode):
         session = self._session
         if session is None:
             raise NotReadyError("no tune is running")
-        acknowledged = self._stop(session, "aborted on request")
+        acknowledged = self._stop(session, Code.REQUESTED())
         but = "" if acknowledged else ", but was not acknowledged"
         safe = session.experiment.after_end(math.nan)
         return f"tune {session.id} aborted; the safe command {safe:g} is out{but}"
@@ -295,17 +292,17 @@ class RelayNode(ServedNode):
 
     # Ending.
 
-    def _stop_now(self, reason: str) -> None:
+    def _stop_now(self, reason: Reason) -> None:
         if (session := self._session) is not None:
             self._stop(session, reason)
 
     def _cancel(self) -> None:
         """End a tune at its client's wish, also one that waits for its model alone."""
-        self._stop_now("cancelled")
+        self._stop_now(Code.CANCELLED())
         if self._awaits_results is not None:
             self._recordings.wait_no_longer(self._awaits_results.id, "cancelled")
 
-    def _stop(self, session: Session, reason: str) -> bool:
+    def _stop(self, session: Session, reason: Reason) -> bool:
         """End a running tune; return True if the safe command was acknowledged."""
         acknowledged = self._send_safe(command := session.experiment.abort(reason))
         self._leave(session, command)
@@ -338,7 +335,8 @@ class RelayNode(ServedNode):
         if experiment.cycles and experiment.settings is not None:
             self._last_cycle = experiment.settings.amplitude, experiment.cycles[-1]
         self._alarm = "" if completed else self._summary
-        lost = losses(session.lost_samples)
+        count = session.lost_samples
+        lost = str(Code.NOTE_LOST(samples=count)) if count else ""
         told = "; ".join(filter(None, (experiment.reason, lost)))
         self.get_logger().info(f"tune {session.id} {outcome}: {told}")
         self._publish_diagnostics()
@@ -363,7 +361,7 @@ class RelayNode(ServedNode):
             self._recordings.close(session.id, f"after a tune that was {outcome}")
             closed("")
 
-    def end(self, reason: str) -> None:
+    def end(self, reason: Reason) -> None:
         """Send the safe command, then finish the record and close the bag."""
         session = self._session
         try:
@@ -389,7 +387,8 @@ class RelayNode(ServedNode):
         told = session.experiment.status
         if (age := self._sensor.age) > SILENT:
             told += f"; no measurement for {duration(age)}"
-        return "; ".join(filter(None, (told, losses(self._lost()))))
+        lost = self._lost()
+        return f"{told}; {Code.NOTE_LOST(samples=lost)}" if lost else told
 
     def _tell(self, status: str) -> None:
         """Send feedback of the tune that runs, or that waits for its model."""
@@ -413,7 +412,7 @@ class RelayNode(ServedNode):
         session = self._session
         problems = [self._alarm] if self._alarm else []
         if self._sensor.misread:
-            problems.append(self._sensor.misread)
+            problems.append(str(self._sensor.misread))
         elif self._sensor.age > self.get_parameter("measurement_timeout").value:
             why = why_no_publisher(self, self._ends.measurement.topic_name, self._reader.type_name)
             problems.append(f"no measurement comes: {why}")

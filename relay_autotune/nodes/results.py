@@ -317,7 +317,7 @@ class OwnResults(ResultCheck):
         if name != MODEL or message.final:
             return TuningError(_TOO_SOON)
         experiment = running.experiment
-        sign, amplitude, relay = experiment.process_gain_sign, math.nan, math.nan
+        sign, amplitude, relay = experiment.facts.sign, math.nan, math.nan
         cycles, settings = experiment.cycles, experiment.settings
         try:
             facts, swing = self._facts_so_far(running)

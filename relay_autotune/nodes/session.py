@@ -37,6 +37,7 @@ from relay_autotune.exchange.messages import (
     fill_cycle,
     fill_experiment,
     fill_settings,
+    fill_whys,
     set_stamp,
     start_seconds,
 )
@@ -213,6 +214,7 @@ class Session:
             message.experiment_id = self.id
             message.outcome = int(experiment.outcome)
             message.reason = experiment.reason
+            fill_whys(message, experiment.why)
             message.noise_std = math.nan
         if self.sample_count:
             set_stamp(message.header.stamp, self.start_ns)
@@ -257,7 +259,7 @@ class Session:
         command = self._answer_at(received, source, measurement, self._step)
         start = self.start_ns
         stepped = self.clocks.add((source - start) * 1e-9, (received - start) * 1e-9)
-        if stepped:
+        if stepped is not None:
             command = self.experiment.abort(stepped)
             self._last = (received, source, measurement, command)
         return command

@@ -16,10 +16,16 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import qos_profile_sensor_data
 
 from relay_autotune.errors import FieldError, LoopError
-from relay_autotune.exchange.messages import made_visible, record_from_message, without_impossible
+from relay_autotune.exchange.messages import (
+    made_visible,
+    reason_from_message,
+    record_from_message,
+    without_impossible,
+)
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.live_types import CommandMessage, reader_of
 from relay_autotune.nodes.loop_client import LoopClient
+from relay_autotune.reasons import Code, Reason
 from relay_autotune.record.record import Record
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
@@ -31,12 +37,6 @@ _GONE = 1.0
 _TICK = 0.05
 # States of an ended goal; the safe command was sent before.
 _ENDED = (GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED)
-# Parts of the refusals that nodes give after their start, until discovery is complete.
-_NOT_YET = (
-    "no measurement has come yet",
-    "no command would arrive",
-    "use_sim_time is true, but no time",
-)
 
 
 class TuneClient(LoopClient):
@@ -193,11 +193,20 @@ class TuneClient(LoopClient):
     @property
     def not_ready_yet(self) -> bool:
         """Whether the reason for the refusal may disappear without action."""
-        refused = not self.succeeded and not self.result.experiment.experiment_id
-        said = (self.result.reason, *self.result.checks)
-        # A publisher of this node, which has held a joint, is known for a while after its end.
-        mine = f"is also published by {self._first.get_fully_qualified_name()}:"
-        return refused and any(reason in text for text in said for reason in (*_NOT_YET, mine))
+        result = self.result
+        refused = not self.succeeded and not result.experiment.experiment_id
+        return refused and any(
+            reason.code.row.transient or self._is_own(reason)
+            for reason in map(reason_from_message, (result.why, *result.refusals))
+        )
+
+    def _is_own(self, reason: Reason) -> bool:
+        """Return whether a second publisher is this client's node, which has held a joint.
+
+        It is known for a while after its end.
+        """
+        mine = self._first.get_fully_qualified_name()
+        return reason.code is Code.SECOND_PUBLISHER and reason["others"] == mine
 
     @property
     def cancelled(self) -> bool:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -29,6 +29,7 @@ from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.nodes.live_types import Reader
 from relay_autotune.nodes.quality import who
+from relay_autotune.reasons import Code, Reason
 
 # Shortest period of a timer, and interval of the graph checks during a tune [s].
 _LEAST_WAIT = 1e-3
@@ -50,15 +51,18 @@ def require_own_time(
     :raises ParameterError: if the first and one of the others are given.
     """
     if sample_period > 0.0 and command_period > 0.0:
+        why = "a plant in lockstep would take each repeated command for the answer to a sample"
         raise ParameterError(
-            f"command_period and sample_period {sample_period:g} s are both given: a plant in "
-            "lockstep would take each repeated command for the answer to a sample; set one of "
-            "them to 0"
+            Code.TWO_CLOCKS(
+                other="command_period", period=sample_period, why=why, which="one of them"
+            )
         )
     if sample_period > 0.0 and repeat_period > 0.0:
+        why = "a sensor that is silent while nothing changes has no constant sample period"
         raise ParameterError(
-            f"repeat_period and sample_period {sample_period:g} s are both given: a sensor that "
-            "is silent while nothing changes has no constant sample period; set sample_period to 0"
+            Code.TWO_CLOCKS(
+                other="repeat_period", period=sample_period, why=why, which="sample_period"
+            )
         )
 
 
@@ -110,11 +114,11 @@ class Repeater:
             return math.inf
         return since_last if self.why_dead() else 0.0
 
-    def why_dead(self) -> str:
-        """Return a sentence if the sensor must be dead, since its publisher has left, else ""."""
+    def why_dead(self) -> Reason | None:
+        """Return a reason if the sensor must be dead, since its publisher has left."""
         if not self._repetition.is_heard or self._node.count_publishers(self._topic):
-            return ""
-        return f"no measurement on {self._topic} any more: its publisher has left"
+            return None
+        return Code.SENSOR_GONE(topic=self._topic)
 
     def _on_kept(self, message: Any) -> None:
         if not self._direct:
@@ -190,11 +194,6 @@ class LastSamples:
         if len(recent) < CONSTANT_SAMPLES:
             return None
         return rest_state(recent[:, 0] - recent[0, 0], recent[:, 1], len(recent))
-
-
-def losses(count: int) -> str:
-    """Say how many samples were lost on the way; "" for none."""
-    return f"{count} {'sample' if count == 1 else 'samples'} lost on the way" if count else ""
 
 
 class Following:
@@ -287,7 +286,7 @@ class Sensor:
         reader: Reader,
         *,
         repeat: Callable[[float, float], None],
-        stop: Callable[[str], None],
+        stop: Callable[[Reason], None],
     ) -> None:
         self._node = node
         self._stop = stop
@@ -299,8 +298,8 @@ class Sensor:
         """To be called with each measurement; None: no call needed."""
         self.samples = LastSamples()
         """The last measurements."""
-        self.misread = ""
-        """Why the last message could not be read; empty: it could."""
+        self.misread: Reason | None = None
+        """Why the last message could not be read; None: it could."""
         self.lost = 0
         """Samples lost since `watch`, by the publisher's numbers."""
         self._arrived = -math.inf
@@ -336,9 +335,9 @@ class Sensor:
         age = self.since_message
         return age if self._repeater is None else self._repeater.age(age)
 
-    def why_dead(self) -> str:
-        """Return why nothing can be measured: its messages, or its publisher has left; else ""."""
-        return self.misread or ("" if self._repeater is None else self._repeater.why_dead())
+    def why_dead(self) -> Reason | None:
+        """Return why nothing can be measured: its messages, or its publisher has left."""
+        return self.misread or (None if self._repeater is None else self._repeater.why_dead())
 
     @property
     def _timeout(self) -> float:
@@ -368,7 +367,7 @@ class Sensor:
             _again(self._timer, self._timeout - age)
             return
         topic = self._node.resolve_topic_name("measurement")
-        self._stop(f"no measurement on {topic} for {age:.3g} s")
+        self._stop(Code.SILENT_SENSOR(topic=topic, silence=age))
 
 
 def _again(timer: Any, wait: float) -> None:
@@ -416,20 +415,17 @@ class FollowWatch:
         self._ends: dict[float, float] = {}
 
     @property
-    def rail(self) -> str:
-        """Sentence part for an actuator that moves but always stops short of the command."""
+    def rail(self) -> dict[str, float]:
+        """The ends of an actuator that moves but always stops short of the command [u]."""
         ends = {**self._ends, self._command: self._position}
         told = sorted(command for command in ends if not math.isnan(command))
         if len(told) < 2:
-            return ""
+            return {}
         low, high = told[0], told[-1]
         moved = ends[high] - ends[low]
         if not 0.0 < moved < high - low - self._tolerance():
-            return ""
-        return (
-            f"; it moves between {ends[low]:g} and {ends[high]:g} only: it is clipped there, give "
-            f"command_min and command_max within these"
-        )
+            return {}
+        return {"low": ends[low], "high": ends[high]}
 
     def add(self, now: float, command: float, position: float) -> bool:
         """Take a position; return True if the actuator does not follow.
@@ -456,6 +452,10 @@ class FollowWatch:
         return late and self._stays.count(False) >= _MISSED
 
 
+Check = Callable[[], Reason | None]
+"""Returns a reason to end a tune, None while there is none."""
+
+
 class Guard:
     """Check the graph, the controller and the actuator every 50 ms while a tune runs.
 
@@ -463,12 +463,12 @@ class Guard:
     :param stop: called with the reason when a check ends the tune.
     """
 
-    def __init__(self, node: Node, stop: Callable[[str], None]) -> None:
+    def __init__(self, node: Node, stop: Callable[[Reason], None]) -> None:
         self._stop = stop
         self._timer = node.create_timer(LOOK_EVERY, self._look, clock=STEADY, autostart=False)
 
-    def begin(self, checks: list[Callable[[], str]], of_graph: list[Callable[[], str]]) -> None:
-        """Start the checks, which return a reason to end the tune, or "".
+    def begin(self, checks: Sequence[Check], of_graph: Sequence[Check]) -> None:
+        """Start the checks.
 
         :param checks: those of each look.
         :param of_graph: those of each fourth look, since they query the middleware.
@@ -489,20 +489,20 @@ class Guard:
                 return
 
 
-def second_publisher(node: Node, topic: str) -> str:
-    """Return a sentence if another node publishes a topic of the node, else "".
+def second_publisher(node: Node, topic: str) -> Reason | None:
+    """Return a reason if another node publishes a topic of the node.
 
     :param node: the node.
     :param topic: resolved name of a topic that it publishes.
     """
     if node.count_publishers(topic) <= 1:
-        return ""
+        return None
     others = _publishers(node, topic, node.get_fully_qualified_name())
-    return f"{topic} is also published by {others}: two of them would fight for the actuator"
+    return Code.SECOND_PUBLISHER(topic=topic, others=others)
 
 
-def second_source(node: Node, subscription: Subscription) -> str:
-    """Return a sentence if a subscription has several publishers, else "".
+def second_source(node: Node, subscription: Subscription) -> Reason | None:
+    """Return a reason if a subscription has several publishers.
 
     A publisher of another type or an incompatible QoS does not count.
 
@@ -511,26 +511,18 @@ def second_source(node: Node, subscription: Subscription) -> str:
     """
     count = subscription.get_publisher_count()
     if count <= 1:
-        return ""
+        return None
     topic = subscription.topic_name
-    return (
-        f"{topic} is published by {count} publishers, {_publishers(node, topic)}, "
-        f"expected one: the relay would act on a mixture; end the others (a killed one leaves the "
-        f"graph after 20 s)"
-    )
+    return Code.SECOND_SOURCE(topic=topic, count=count, others=_publishers(node, topic))
 
 
-def namesake(node: Node) -> str:
-    """Return a sentence if another node has the node's own full name, else ""."""
+def namesake(node: Node) -> Reason | None:
+    """Return a reason if another node has the node's own full name."""
     mine = (node.get_name(), node.get_namespace())
     count = node.get_node_names_and_namespaces().count(mine)
     if count <= 1:
-        return ""
-    return (
-        f"{count} nodes have the name {node.get_fully_qualified_name()}, expected one: a "
-        f"call reaches any of them; end the others (a killed one leaves the graph after 20 s), or "
-        f"give them other names"
-    )
+        return None
+    return Code.NAMESAKE(count=count, node=node.get_fully_qualified_name())
 
 
 def _publishers(node: Node, topic: str, but: str = "") -> str:
@@ -541,17 +533,17 @@ def _publishers(node: Node, topic: str, but: str = "") -> str:
     return " and ".join(names) or "another node"
 
 
-def silence(what: str, timeout: float, age: Callable[[], float]) -> Callable[[], str]:
+def silence(reason: Callable[..., Reason], timeout: float, age: Callable[[], float]) -> Check:
     """Return a check of the silence of a signal, on the steady clock, for :class:`Guard`.
 
-    :param what: subject of the sentence.
+    :param reason: takes the silence.
     :param timeout: longest silence [s].
     :param age: returns the time since the last message [s].
     """
 
-    def look() -> str:
+    def look() -> Reason | None:
         silent = age()
-        return f"{what} for {silent:.3g} s" if silent > timeout else ""
+        return reason(silence=silent) if silent > timeout else None
 
     return look
 
@@ -594,20 +586,14 @@ class Overtime:
             _SLACK_SIMULATED if simulated or by_number else _SLACK,
         )
 
-    def __call__(self) -> str:
-        """Return a sentence if a limit is passed, else ""."""
+    def __call__(self) -> Reason | None:
+        """Return a reason if a limit is passed."""
         tune, present = self._experiment, now()
         if tune.elapsed != self._elapsed:
             self._elapsed, self._moved_at = tune.elapsed, present
         if (still := present - self._moved_at) > self._standing:
-            return (
-                f"the time of the measurement has stood still at {tune.elapsed:.6g} s for "
-                f"{still:.3g} s: check /clock, or what stamps the measurement"
-            )
+            return Code.TIME_STANDS(time=tune.elapsed, still=still)
         most = min(tune.latest, tune.parameters.max_duration or math.inf)
         if (lasted := present - self._begin) > self._slack * most + self._standing:
-            return (
-                f"the tune is not over after {lasted:.4g} s, of which the measurement's clock "
-                f"tells {tune.elapsed:.4g} s: check /clock, or what stamps the measurement"
-            )
-        return ""
+            return Code.OVERTIME(lasted=lasted, time=tune.elapsed)
+        return None

@@ -21,6 +21,7 @@ import rclpy
 import yaml
 from made_experiments import record_of
 
+from relay_autotune import reasons as core
 from relay_autotune.cli import report, tune_loop
 from relay_autotune.cli.after_tune import AfterTune, prefix
 from relay_autotune.cli.loops import Loop, TopicLoop
@@ -29,17 +30,18 @@ from relay_autotune.cli.settings import Kind, kind_of, with_flags
 from relay_autotune.cli.terminal import agrees, asked_for_file, number_of, pair_of
 from relay_autotune.errors import LoopError, ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS, Target, exported
-from relay_autotune.exchange.messages import fill_gains
+from relay_autotune.exchange.messages import fill_gains, fill_reason
 from relay_autotune.nodes.gains_file import with_gains_file
 from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.reasons import Code
 from relay_autotune.tuning import DesignOptions, DesignTask, design
 from relay_autotune.verdict import Verdict
 from relay_autotune_msgs.action import Tune
-from relay_autotune_msgs.msg import PidGains
+from relay_autotune_msgs.msg import PidGains, Reason
 
 
 def test_the_last_line_of_a_node_that_died_ends_every_wait_for_it() -> None:
@@ -349,8 +351,10 @@ def topic_loop(client: Any, given: argparse.Namespace) -> TopicLoop:
     return loop
 
 
-def ended(reason: str, **values: Any) -> Any:
-    return Tune.Result(outcome=Tune.Result.ABORTED, reason=reason, **values)
+def ended(why: core.Reason, **values: Any) -> Any:
+    found = Tune.Result(outcome=Tune.Result.ABORTED, reason=str(why), **values)
+    fill_reason(found.why, why)
+    return found
 
 
 def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
@@ -369,12 +373,12 @@ def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
         client: Any = SimpleNamespace(result=result, record=lambda patience: inside)
         return AfterTune(topic_loop(client, given), parser).repeated(proven)
 
-    silent = ended("no measurement on /tank/level for 1.01 s")
+    silent = ended(Code.SILENT_SENSOR(topic="/tank/level", silence=1.01))
     (what, command), (then, told) = repeated(silent, None)
     assert (what, command, then) == ("run it again", again, "if it happens again")
     assert "ros2 topic hz /tank/level" in told and "the load of the machine" in told
-    assert repeated(ended("cancelled"), None) == [("run it again", again)]
-    found = ended("", gains=PidGains(experiment_id="x"))
+    assert repeated(ended(Code.CANCELLED()), None) == [("run it again", again)]
+    found = ended(core.NONE, gains=PidGains(experiment_id="x"))
     assert repeated(found, None) == [("prove the gains", f"{again} --verify")]
     assert repeated(found, True) == []
 
@@ -536,29 +540,25 @@ def test_a_launch_file_starts_the_controller_with_limits_and_topics() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reason", "outside", "left_at", "next_step"),
+    ("code", "outside", "left_at", "next_step"),
     [
-        (
-            "the measurement rested at 6 y and is at 6.2 y",
-            False,
-            "not the one at",
-            "once it rests",
-        ),
-        ("the measurement 9.1 at 3 s is too high", True, "look whether", "once it rests"),
-        ("the node failed: KeyError: 1 (a.py:1)", False, "the plant is left at", "report it"),
-        ("cancelled", False, "the plant is left at the safe command 1040 u", "run it again"),
+        (Code.NOT_AT_BASELINE, False, "not the one at", "once it rests"),
+        (Code.OUTSIDE_LIMITS, True, "look whether", "once it rests"),
+        (Code.NODE_FAILED, False, "the plant is left at", "report it"),
+        (Code.CANCELLED, False, "the plant is left at the safe command 1040 u", "run it again"),
     ],
 )
 def test_after_an_end_that_would_come_again_the_same_command_is_not_offered_again(
-    reason, outside, left_at, next_step
+    code, outside, left_at, next_step
 ):
     words = ["--measurement", "/y", "--command", "/u", "--at", "1040", "--within", "3", "9"]
     parser = tune_loop._parser()
     given = parser.parse_args(words)
     given.typed = words
     result = SimpleNamespace(
-        reason=reason, outcome=2, ABORTED=2, COMPLETED=1, gains=SimpleNamespace(experiment_id="")
-    )
+        why=Reason(code=code), outcome=2, ABORTED=2, COMPLETED=1,
+        gains=SimpleNamespace(experiment_id=""),
+    )  # fmt: skip
     last = np.array([5.0, 9.1 if outside else 6.2])
     client: Any = SimpleNamespace(
         result=result, record=lambda patience: SimpleNamespace(measurement=last)
@@ -576,9 +576,11 @@ def test_after_an_end_that_would_come_again_the_same_command_is_not_offered_agai
     [("/t/tune_loop", True), ("/pid", False), ("/pid and /t/tune_loop", False)],
 )
 def test_a_publisher_of_its_own_that_has_ended_is_no_reason_to_give_up(other, passes):
-    reason = f"/u is also published by {other}: two of them would fight for the actuator"
-    client: Any = SimpleNamespace(
-        succeeded=False, result=Tune.Result(reason=reason),
-        _first=SimpleNamespace(get_fully_qualified_name=lambda: "/t/tune_loop"),
-    )  # fmt: skip
-    assert TuneClient.not_ready_yet.fget(client) is passes
+    refused = Tune.Result()
+    fill_reason(refused.why, Code.SECOND_PUBLISHER(topic="/u", others=other))
+
+    class Client(TuneClient):
+        succeeded, result = False, refused
+        _first = SimpleNamespace(get_fully_qualified_name=lambda: "/t/tune_loop")
+
+    assert Client.__new__(Client).not_ready_yet is passes

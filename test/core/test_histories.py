@@ -15,9 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
-from relay_autotune.experiment.oscillation import MOST_BORNE
 from relay_autotune.experiment.relay_law import OVERDUE, DwellFilter
 from relay_autotune.experiment.samples import GAP, Samples
+from relay_autotune.experiment.switching import MOST_COMPENSATED
 from relay_autotune.record.record import Outcome
 
 PART = 30
@@ -40,7 +40,7 @@ def test_a_stay_that_only_shifts_of_the_levels_end_grants_the_next_no_longer_one
     history = History(1625)
     tune = history.run()
     assert not history.problem, f"{history.problem}: {history}"
-    assert f"{MOST_BORNE} stays ended only when the levels were shifted" in tune.reason
+    assert f"{MOST_COMPENSATED} stays ended only when the levels were shifted" in tune.reason
     time, _, command = tune.samples(0, tune.sample_count)
     # Shifts only make a level larger in its own direction, within a stay.
     rises = np.sign(command - tune.settings.baseline)
@@ -62,7 +62,7 @@ def disturbed(begin, length, *, kind, min_cycles=3, period=0.01, samples=20_000)
     )
     command, acting, now = 0.0, 0.0, 0.0
     for k in range(samples):
-        acts = tune.kicked_at + begin <= k * period < tune.kicked_at + begin + length
+        acts = tune.facts.kicked_at + begin <= k * period < tune.kicked_at + begin + length
         if not (acts and kind == "stuck"):
             acting = command
         load = 0.5 if acts and kind == "load" else 0.0

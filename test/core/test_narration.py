@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment, State
-from relay_autotune.experiment.procedure import how_long
+from relay_autotune.experiment.phases import how_long
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import VirtualProcess
 

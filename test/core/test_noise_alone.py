@@ -12,6 +12,7 @@ from relay_autotune.experiment.experiment import ExperimentParameters, RelayExpe
 from relay_autotune.experiment.faults import why_noise_alone
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.reasons import Code
 from relay_autotune.record.record import Outcome
 
 PROCESS = structure_named("lag_n").of_fields(
@@ -38,8 +39,9 @@ def test_an_actuator_that_sticks_while_the_amplitude_is_found_ends_the_tune(seed
 def test_noise_and_an_oscillation_are_told_apart():
     rng = np.random.default_rng(0)
     noise = 0.1 * rng.standard_normal(60)
-    assert "only noise" in why_noise_alone(noise, 0.1, "2 whole cycles")
+    why = why_noise_alone(noise, 0.1, 2)
+    assert why is not None and why.code is Code.NOISE_ALONE
     # What a relay with a band of three standard deviations lets pass at the least.
     ramp = np.linspace(-0.3, 0.3, 60) + noise
-    assert not why_noise_alone(ramp, 0.1, "2 whole cycles")
-    assert not why_noise_alone(np.zeros(60), 0.0, "2 whole cycles")
+    assert not why_noise_alone(ramp, 0.1, 2)
+    assert not why_noise_alone(np.zeros(60), 0.0, 2)

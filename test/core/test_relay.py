@@ -62,7 +62,7 @@ def test_periods_and_peaks_meet_the_closed_forms(ratio, gain, sign_given):
     )
     run(tune, FopdtPlant(gain, tau, ratio * tau), period, offset=5.0)
     assert tune.outcome is Outcome.COMPLETED, tune.reason
-    assert tune.process_gain_sign == math.copysign(1, gain)
+    assert tune.facts.sign == math.copysign(1, gain)
     cycle = limit_cycle(tune.record())
     high, low, up, down = wang_limit_cycle(abs(gain), tau, ratio * tau, 1.0, 0.3, eps)
     # Each switch is late by up to one sample, which also adds to each peak.
@@ -91,7 +91,7 @@ def test_periods_converge_to_the_closed_forms_with_the_sample_period(gain):
 def test_the_dead_time_is_seen_to_a_sample():
     tune = experiment()
     run(tune, FopdtPlant(2.0, 5.0, 0.735), 0.01)
-    assert 0.0 <= 0.735 - tune.dead_time_seen < 0.01
+    assert 0.0 <= 0.735 - tune.facts.dead_time_seen < 0.01
 
 
 def test_the_command_takes_the_levels_of_the_relay_only():
@@ -169,7 +169,7 @@ def test_noise(ratio, level, seed):
     tune = experiment()
     run(tune, FopdtPlant(1.0, 1.0, ratio), ratio / 60, noise=gaussian(std, seed))
     assert tune.outcome is Outcome.COMPLETED, tune.reason
-    assert tune.process_gain_sign == 1
+    assert tune.facts.sign == 1
     assert tune.cycles[-1].converged
     assert tune.noise_std == pytest.approx(std, rel=0.4)
     assert tune.settings.hysteresis == 3.0 * tune.noise_std
@@ -216,7 +216,7 @@ def test_other_processes_oscillate_and_their_sign_is_found(model, gain, sign_giv
     tune = experiment(process_gain_sign=int(math.copysign(sign_given, gain)))
     run(tune, Plant(model(gain)), 0.05, samples=20_000)
     assert tune.outcome is Outcome.COMPLETED, tune.reason
-    assert tune.process_gain_sign == math.copysign(1, gain)
+    assert tune.facts.sign == math.copysign(1, gain)
     assert tune.cycles[-1].converged
 
 
@@ -318,7 +318,7 @@ def test_it_waits_for_a_transient_to_end():
     while tune.state is State.SETTLING:
         command = tune.step(0.05 * k, plant.advance(0.05 * k, command) + noise())
         k += 1
-    assert tune.rest_measurement == pytest.approx(0.0, abs=0.02)
+    assert tune.facts.rest.mean == pytest.approx(0.0, abs=0.02)
     assert tune.noise_std == pytest.approx(0.01, rel=0.4)
 
 
@@ -513,7 +513,7 @@ def test_any_fopdt_process_completes(
         samples=60_000,
     )
     assert tune.outcome is Outcome.COMPLETED, tune.reason
-    assert tune.process_gain_sign == math.copysign(1, gain)
+    assert tune.facts.sign == math.copysign(1, gain)
     record = tune.record()
     assert len(record) == count
     assert set(record.command) <= {1.0, record.settings.high, record.settings.low}

@@ -58,7 +58,7 @@ def test_a_wrong_baseline_ends_the_tune_before_the_process_is_far_away(acting, b
 def test_without_the_word_that_it_is_the_present_command_a_baseline_may_lead_elsewhere():
     tune, _ = tuned(1100.0, 1, 50, watched=False, noise_std=0.02)
     assert tune.state is State.KICK
-    assert tune.rest_measurement == pytest.approx(8.0, abs=0.2)
+    assert tune.facts.rest.mean == pytest.approx(8.0, abs=0.2)
 
 
 @pytest.mark.parametrize(
@@ -106,4 +106,4 @@ def test_what_moved_before_the_rest_does_not_hide_that_it_leaves():
     moved = np.where(np.arange(200) < 80, 100.0, 6.0) + noise[:200]
     watch = RestWatch(moved)
     told = [watch.leaves(6.0 + 0.01 * k + noise[200 + k]) for k in range(60)]
-    assert told[-1].startswith("the measurement rested at 6")
+    assert told[-1] and watch.rested_at == pytest.approx(6.0, abs=0.01)

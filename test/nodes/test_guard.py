@@ -19,6 +19,7 @@ from relay_autotune.nodes.watch import (
     second_publisher,
     second_source,
 )
+from relay_autotune.reasons import Code
 
 LOW, HIGH = 0.5, 1.5
 TIMEOUT = 0.4
@@ -62,7 +63,7 @@ def test_one_that_lags_by_half_of_a_stay_follows(stay):
     assert noticed(lambda t: command(max(t - lag, 0.0), stay), stay) == float("inf")
 
 
-@pytest.mark.parametrize(("ends", "said"), [((0.0, 5.0), "between 0 and 5 only"), ((9, 9), "")])
+@pytest.mark.parametrize(("ends", "said"), [((0.0, 5.0), {"low": 0.0, "high": 5.0}), ((9, 9), {})])
 def test_one_that_is_clipped_is_told_from_one_that_is_stuck(ends, said):
     watch = FollowWatch(lambda: 50.0, TIMEOUT)
     low, high = ends
@@ -71,8 +72,7 @@ def test_one_that_is_clipped_is_told_from_one_that_is_stuck(ends, said):
         if watch.add(k * EVERY, told, min(max(told, low), high)):
             break
     assert k < 399
-    assert said in watch.rail
-    assert bool(watch.rail) == bool(said)
+    assert watch.rail == said
 
 
 def test_one_that_lags_by_a_stay_does_not():
@@ -138,44 +138,41 @@ class Graph:
 
 
 def test_two_sources_are_told_with_their_names():
-    assert second_source(Graph(), Graph()) == ""
-    assert second_source(one := Graph([("/tank", "sensor")]), one) == ""
+    assert second_source(Graph(), Graph()) is None
+    assert second_source(one := Graph([("/tank", "sensor")]), one) is None
     both = Graph([("/tank", "sensor"), ("/", "old_sensor")])
-    assert "by 2 publishers, /old_sensor and /tank/sensor, expected one" in second_source(
-        both, both
-    )
+    found = second_source(both, both)
+    assert found.code is Code.SECOND_SOURCE and found["count"] == 2
+    assert found["others"] == "/old_sensor and /tank/sensor"
     same = Graph([("/tank", "sensor"), ("/tank", "sensor")])
-    assert "/tank/sensor and /tank/sensor" in second_source(same, same)
+    assert second_source(same, same)["others"] == "/tank/sensor and /tank/sensor"
     new = Graph([("/tank", "sensor"), (UNKNOWN, UNKNOWN)])
-    assert "/tank/sensor and a node not known yet" in second_source(new, new)
+    assert second_source(new, new)["others"] == "/tank/sensor and a node not known yet"
 
 
 def test_a_second_publisher_of_the_own_name_is_told_too():
     mine = ("/tank", "relay_node")
-    assert second_publisher(Graph([mine]), "/tank/level") == ""
-    told = second_publisher(Graph([mine, ("/", "other")]), "/tank/level")
-    assert told.startswith("/tank/level is also published by /other: ")
-    told = second_publisher(Graph([mine, mine]), "/tank/level")
-    assert "also published by /tank/relay_node: " in told
+    assert second_publisher(Graph([mine]), "/tank/level") is None
+    for there, others in ([("/", "other")], "/other"), ([mine], "/tank/relay_node"):
+        found = second_publisher(Graph([mine, *there]), "/tank/level")
+        assert found == Code.SECOND_PUBLISHER(topic="/tank/level", others=others)
 
 
 def test_a_namesake_has_the_name_and_the_namespace():
     mine = ("relay_node", "/tank")
-    assert namesake(Graph(nodes=[mine, ("relay_node", "/kiln"), ("plant", "/tank")])) == ""
-    assert namesake(Graph(nodes=[mine, mine])).startswith(
-        "2 nodes have the name /tank/relay_node, expected one: "
-    )
+    assert namesake(Graph(nodes=[mine, ("relay_node", "/kiln"), ("plant", "/tank")])) is None
+    assert namesake(Graph(nodes=[mine, mine])) == Code.NAMESAKE(count=2, node="/tank/relay_node")
 
 
 @pytest.mark.parametrize(
     ("rate", "most", "duration", "expected"),
     [
         # The samples' time over the steady clock's: as it is, a bit slow, stuck, nearly stuck.
-        (1.0, 100.0, 0.0, ""),
-        (0.5, 100.0, 0.0, ""),
-        (0.0, 100.0, 0.0, "has stood still at 0 s for 5"),
-        (1e-6, 100.0, 0.0, "the tune is not over after 305"),
-        (1e-6, math.inf, 40.0, "the tune is not over after 125"),
+        (1.0, 100.0, 0.0, None),
+        (0.5, 100.0, 0.0, None),
+        (0.0, 100.0, 0.0, (Code.TIME_STANDS, "still", 5.0)),
+        (1e-6, 100.0, 0.0, (Code.OVERTIME, "lasted", 305.0)),
+        (1e-6, math.inf, 40.0, (Code.OVERTIME, "lasted", 125.0)),
     ],
 )
 def test_a_tune_ends_by_the_steady_clock(monkeypatch, rate, most, duration, expected):
@@ -184,11 +181,11 @@ def test_a_tune_ends_by_the_steady_clock(monkeypatch, rate, most, duration, expe
     )
     present = 1000.0
     monkeypatch.setattr(watch, "now", lambda: present)
-    look, said = Overtime(tune, standing=5.0, slack=3.0), ""
+    look, why = Overtime(tune, standing=5.0, slack=3.0), None
     # An experiment that goes on by its own time ends by its own limit.
-    while not said and rate * (present - 1000.0) <= most:
+    while why is None and rate * (present - 1000.0) <= most:
         present += 0.05
         tune.elapsed = rate * (present - 1000.0)
-        said = look()
-    assert said.startswith("the t") if expected else not said
-    assert expected in said
+        why = look()
+    found = why and (why.code, why[expected[1]])
+    assert found == (expected and (expected[0], pytest.approx(expected[2], abs=0.1)))

@@ -22,6 +22,7 @@ from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller import ControllerNode
 from relay_autotune.nodes.live_types import FLOAT64, reader_of
 from relay_autotune.nodes.watch import Repeater, require_own_time
+from relay_autotune.reasons import Code
 
 PERIOD = 0.4
 # Turns of the executor, more than there is to do: nothing happens in the last ones.
@@ -130,7 +131,8 @@ def test_with_simulated_time_a_silence_is_as_long_as_that_clock_says(
     assert value == 6.0
     assert at in (3.0, 3.5)
     loop.world.destroy_publisher(loop.sensor)
-    loop.until(lambda: "its publisher has left" in repeater.why_dead())
+    loop.until(lambda: repeater.why_dead() is not None)
+    assert repeater.why_dead().code is Code.SENSOR_GONE
 
 
 def test_the_controller_integrates_while_the_sensor_stands_by_its_value(

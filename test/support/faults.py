@@ -26,6 +26,7 @@ from rclpy.node import Node
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
+from relay_autotune.reasons import Code
 from relay_autotune_msgs.action import Tune
 
 BROKEN = """
@@ -45,6 +46,11 @@ OTHER_SIGNALS = (
     signal.SIGQUIT, signal.SIGABRT, signal.SIGALRM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGPWR,
     signal.SIGTSTP, signal.SIGXCPU, signal.SIGIO, signal.SIGRTMIN, signal.SIGRTMIN + 5,
 )  # fmt: skip
+
+Why = Code | tuple[Code, ...]
+AWAY = Code.MOVED_AWAY_LOAD, Code.MOVED_AWAY_UNSTABLE
+LOST = Code.NO_ANSWER, *AWAY, Code.SATURATED, Code.TOO_SLOW, Code.TOO_FEW_SAMPLES
+FAST = Code.FAST_CYCLES, Code.FAST_IN_CYCLE, Code.FAST_STAYS
 
 Undo = Callable[[], object]
 Cause = Callable[[Loop, Random], "Undo | None"]
@@ -67,12 +73,12 @@ class Fault:
 
 
 def in_a_tune(
-    cause: Cause, said: str, *, kind: str = "plain", at_start: bool = False, **parameters: Any
+    cause: Cause, why: Why, *, kind: str = "plain", at_start: bool = False, **parameters: Any
 ) -> Fault:
     """Return a fault that ends a tune with a reason.
 
     :param cause: causes the fault; returns the function that undoes it, None: the loop's reset.
-    :param said: text that the reason must contain.
+    :param why: the code of the reason, or one of several.
     :param kind: kind of the loop.
     :param at_start: True: the fault exists from the start; False: from a random moment on.
     :param parameters: parameters of the relay, besides the usual ones.
@@ -88,7 +94,7 @@ def in_a_tune(
         undo = cause(loop, random)
         try:
             taken = until_safe(loop, began)
-            loop.check_the_end(said)
+            loop.check_the_end(why)
             loop.check_that_it_stays()
         finally:
             if undo is not None:
@@ -98,12 +104,12 @@ def in_a_tune(
     return Fault(course, kind)
 
 
-def with_the_node(code: str, number: int, said: str, status: int) -> Fault:
+def with_the_node(code: str, number: int, why: Why, status: int) -> Fault:
     """Return a fault with which the process of relay_node ends.
 
     :param code: Python code instead of the executable; "": the executable.
     :param number: signal that ends it; 0: it ends by itself.
-    :param said: text that the reason must contain.
+    :param why: the code of the reason, or one of several.
     :param status: its exit status.
     """
 
@@ -119,7 +125,7 @@ def with_the_node(code: str, number: int, said: str, status: int) -> Fault:
         else:
             loop.rig.until(lambda: loop.commands[-1] != BASELINE, "a first step")
             began = time.monotonic()
-        return ended_by_itself(loop, began, said, status)
+        return ended_by_itself(loop, began, why, status)
 
     return Fault(course)
 
@@ -127,21 +133,18 @@ def with_the_node(code: str, number: int, said: str, status: int) -> Fault:
 def any_other_signal(loop: Loop, random: Random) -> float:
     """Send a signal that ends a process without a handler."""
     number = random.choice(OTHER_SIGNALS)
-    name = f"SIGRTMIN+{number - signal.SIGRTMIN}"
-    if number in set(signal.Signals):
-        name = signal.Signals(number).name
-    return with_the_node("", number, f"was stopped by {name}", 0).course(loop, random)
+    return with_the_node("", number, Code.SIGNAL, 0).course(loop, random)
 
 
-def ended_by_itself(loop: Loop, began: float, said: str, status: int) -> float:
+def ended_by_itself(loop: Loop, began: float, why: Why, status: int) -> float:
     """Check that relay_node ends its tune and itself; return the time since the cause [s].
 
     :param began: time of the cause.
-    :param said: text that the reason must contain.
+    :param why: the code of the reason, or one of several.
     :param status: its exit status.
     """
     taken = until_safe(loop, began)
-    loop.check_the_end(said)
+    loop.check_the_end(why)
     assert loop.process is not None
     assert loop.process.wait() == status
     assert "Traceback" not in loop.process.log
@@ -176,7 +179,7 @@ def terminal_closed(loop: Loop, random: Random) -> float:
     wait_for_a_moment(loop, random)
     began = time.monotonic()
     os.close(window)
-    return ended_by_itself(loop, began, "was stopped by SIGHUP", 0)
+    return ended_by_itself(loop, began, Code.SIGNAL, 0)
 
 
 def output_not_taken(
@@ -205,7 +208,7 @@ def output_not_taken(
         began = time.monotonic()
         abort(loop, random)
         taken = until_safe(loop, began)
-        loop.check_the_end("aborted on request")
+        loop.check_the_end(Code.REQUESTED)
         loop.check_that_it_stays()
         assert loop.process is not None
         loop.process.signal(signal.SIGTERM)
@@ -389,7 +392,7 @@ def actuator(loop: Loop, random: Random) -> float:
             speak()
         stuck, began = True, time.monotonic()
         taken = until_safe(loop, began)
-        loop.check_the_end("the actuator does not follow")
+        loop.check_the_end(Code.NOT_FOLLOWING)
         loop.check_that_it_stays()
     finally:
         node.destroy_timer(timer)
@@ -416,7 +419,7 @@ def controller(loop: Loop, random: Random, *, in_tune: bool) -> float:
             wait_for_a_moment(loop, random)
             speaking, began = False, time.monotonic()
             taken = until_safe(loop, began)
-            loop.check_the_end("no command on /controller_command for")
+            loop.check_the_end(Code.SILENT_CONTROLLER)
         else:
             loop.begin()
             loop.rig.run_for(random.uniform(0.05, 0.2))
@@ -445,7 +448,7 @@ def cancelled(loop: Loop, random: Random) -> float:
     began = time.monotonic()
     sent.result().cancel_goal_async()
     taken = until_safe(loop, began)
-    loop.check_the_end("cancelled")
+    loop.check_the_end(Code.CANCELLED)
     loop.rig.until(answer.done, "the result")
     assert answer.result().status == GoalStatus.STATUS_CANCELED
     assert not answer.result().result.gains.experiment_id
@@ -456,94 +459,78 @@ def cancelled(loop: Loop, random: Random) -> float:
 
 FAULTS = {
     "silent sensor": in_a_tune(
-        altered(lambda _, y: None), "no measurement on /measurement for", measurement_timeout=1.2
+        altered(lambda _, y: None), Code.SILENT_SENSOR, measurement_timeout=1.2
     ),
-    "frozen sensor": in_a_tune(frozen, "the sensor is frozen"),
-    "NaN from the sensor": in_a_tune(
-        altered(lambda _, y: math.nan), "is nan, expected a finite number"
-    ),
-    "infinity from the sensor": in_a_tune(
-        altered(lambda _, y: -math.inf), "is -inf, expected a finite number"
-    ),
+    "frozen sensor": in_a_tune(frozen, Code.FROZEN_SENSOR),
+    "NaN from the sensor": in_a_tune(altered(lambda _, y: math.nan), Code.BAD_MEASUREMENT),
+    "infinity from the sensor": in_a_tune(altered(lambda _, y: -math.inf), Code.BAD_MEASUREMENT),
     "measurement limits": in_a_tune(
-        altered(lambda _, y: y + 100.0), "is outside its limits", measurement_max=50.0
+        altered(lambda _, y: y + 100.0), Code.OUTSIDE_LIMITS, measurement_max=50.0
     ),
     "largest deviation": in_a_tune(
-        altered(lambda _, y: y + 100.0), "max_deviation, 10", max_deviation=10.0
+        altered(lambda _, y: y + 100.0), Code.TOO_FAR, max_deviation=10.0
     ),
     "longest half cycle": in_a_tune(
-        altered(lambda loop, y: 4.9 + loop.noise()), "did not come back", max_half_cycle=0.7
+        altered(lambda loop, y: 4.9 + loop.noise()), LOST, max_half_cycle=0.7
     ),
     "longest experiment": in_a_tune(
-        lambda loop, random: None, "max_duration 1 s was over", at_start=True, max_duration=1.0
+        lambda loop, random: None, Code.MAX_DURATION, at_start=True, max_duration=1.0
     ),
     "no response": in_a_tune(
         altered(lambda loop, y: 5.0 + loop.noise()),
-        "was over while waiting",
+        Code.MAX_DURATION,
         at_start=True,
         max_duration=0.5,
     ),
     "response that saturates": in_a_tune(
-        altered(lambda loop, y: min(y, 4.9) + 1e-2 * loop.noise()), "the response saturates"
+        altered(lambda loop, y: min(y, 4.9) + 1e-2 * loop.noise()), Code.SATURATED
     ),
-    "gain of the wrong sign": in_a_tune(
-        wrong_sign, "process_gain_sign may be wrong", at_start=True
-    ),
-    "unstable growth": in_a_tune(growing, "the oscillation grows faster and faster"),
-    "fast switching": in_a_tune(jittering, "the relay switches fast"),
-    "step of the source's clock": in_a_tune(
-        clock_step(0.2), "a clock has stepped", kind="stamped"
-    ),
-    "source time that goes back": in_a_tune(
-        clock_step(-1.0), "time went backwards", kind="stamped"
-    ),
-    "/clock that goes back": in_a_tune(clock_step(-1.0), "time went backwards", kind="clock"),
+    "gain of the wrong sign": in_a_tune(wrong_sign, AWAY, at_start=True),
+    "unstable growth": in_a_tune(growing, Code.GROWING),
+    "fast switching": in_a_tune(jittering, FAST),
+    "step of the source's clock": in_a_tune(clock_step(0.2), Code.CLOCK_STEPPED, kind="stamped"),
+    "source time that goes back": in_a_tune(clock_step(-1.0), Code.TIME_BACKWARDS, kind="stamped"),
+    "/clock that goes back": in_a_tune(clock_step(-1.0), Code.TIME_BACKWARDS, kind="clock"),
     "/clock that stands still": in_a_tune(
-        clock_stands, "has stood still", kind="clock", measurement_timeout=2.5
+        clock_stands, Code.TIME_STANDS, kind="clock", measurement_timeout=2.5
     ),
-    "sensor on change that has left": in_a_tune(
-        sensor_leaves, "no measurement on /measurement any more", kind="on change"
-    ),
+    "sensor on change that has left": in_a_tune(sensor_leaves, Code.SENSOR_GONE, kind="on change"),
     "sensor on change, silent in a cycle": in_a_tune(
-        silent_in_a_cycle, "does not respond any more", kind="on change"
+        silent_in_a_cycle, Code.SILENT_TOO_LONG, kind="on change"
     ),
     "sensor on change, silent before a cycle": in_a_tune(
-        before_a_cycle, "it does not respond", kind="on change", at_start=True, max_half_cycle=0.6
+        before_a_cycle, Code.NO_ANSWER, kind="on change", at_start=True, max_half_cycle=0.6
     ),
-    "joint that is missing": in_a_tune(
-        joints("right", "arm"), "cannot be read: velocity[left]: the list name has", kind="joint"
-    ),
+    "joint that is missing": in_a_tune(joints("right", "arm"), Code.MISREAD, kind="joint"),
     "joint that is there twice": in_a_tune(
-        joints("left", "arm", "left"), "has 'left' 2 times", kind="joint"
+        joints("left", "arm", "left"), Code.MISREAD, kind="joint"
     ),
     "silent sensor under a Twist": in_a_tune(
         altered(lambda _, y: None),
-        "no measurement on /measurement for",
+        Code.SILENT_SENSOR,
         kind="joint",
         measurement_timeout=1.2,
     ),
     "limits under a Twist": in_a_tune(
         altered(lambda _, y: y + 100.0),
-        "is outside its limits",
+        Code.OUTSIDE_LIMITS,
         kind="joint",
         measurement_max=50.0,
     ),
-    "abort under a Twist": in_a_tune(abort, "aborted on request", kind="joint"),
-    "second publisher of command": in_a_tune(
-        second_publisher("command"), "/command is also published by "
-    ),
+    "abort under a Twist": in_a_tune(abort, Code.REQUESTED, kind="joint"),
+    "second publisher of command": in_a_tune(second_publisher("command"), Code.SECOND_PUBLISHER),
     "second publisher of measurement": in_a_tune(
-        second_publisher("measurement"), "/measurement is published by 2 publishers, /onlooker"
+        second_publisher("measurement"), Code.SECOND_SOURCE
     ),
-    "second node of the name": in_a_tune(second_node, "2 nodes have the name /relay_node"),
+    "second node of the name": in_a_tune(second_node, Code.NAMESAKE),
     "controller silent in a tune": Fault(partial(controller, in_tune=True)),
     "controller silent when idle": Fault(partial(controller, in_tune=False)),
     "actuator that does not follow": Fault(actuator),
-    "abort": in_a_tune(abort, "aborted on request"),
+    "abort": in_a_tune(abort, Code.REQUESTED),
     "cancelled action": Fault(cancelled),
-    "SIGINT": with_the_node("", signal.SIGINT, "was stopped by SIGINT", 0),
-    "SIGTERM": with_the_node("", signal.SIGTERM, "was stopped by SIGTERM", 0),
-    "SIGHUP": with_the_node("", signal.SIGHUP, "was stopped by SIGHUP", 0),
+    "SIGINT": with_the_node("", signal.SIGINT, Code.SIGNAL, 0),
+    "SIGTERM": with_the_node("", signal.SIGTERM, Code.SIGNAL, 0),
+    "SIGHUP": with_the_node("", signal.SIGHUP, Code.SIGNAL, 0),
     "any other signal": Fault(any_other_signal),
     "terminal that is closed": Fault(terminal_closed),
     "terminal that is paused": Fault(
@@ -551,5 +538,5 @@ FAULTS = {
     ),
     "output that is full": Fault(partial(output_not_taken, make=small_pipe)),
     "output that is gone": Fault(partial(output_not_taken, make=small_pipe, stop=os.close)),
-    "exception in a callback": with_the_node(BROKEN, 0, "ZeroDivisionError: a defect", 1),
+    "exception in a callback": with_the_node(BROKEN, 0, Code.NODE_FAILED, 1),
 }

@@ -28,6 +28,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float32, Float64, Float64MultiArray
 
+from relay_autotune.reasons import Code
 from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment
 
 BASELINE, SAFE, REST = 1.0, 0.75, 5.0
@@ -303,13 +304,13 @@ class Loop:
         """Return True if the newest diagnostics have a text."""
         return any(text in s.message for m in self.status[-3:] for s in m.status)
 
-    def check_the_end(self, said: str, safe: float = SAFE) -> Any:
+    def check_the_end(self, why: Code | tuple[Code, ...], safe: float = SAFE) -> Any:
         """Check that a tune ended safely and with a reason; return its record."""
         ended = self.ended()
-        assert said in ended.reason, ended.reason
+        assert ended.why.code in (why if isinstance(why, tuple) else (why,)), ended.reason
         assert ended.outcome in (RelayExperiment.ABORTED, RelayExperiment.FAILED)
         self.rig.until(lambda: self.commands[-1] == safe, "the safe command")
-        self.rig.until(lambda: self.is_said(said), "the diagnostics")
+        self.rig.until(lambda: self.is_said(ended.reason), "the diagnostics")
         assert not self.gains
         return ended
 

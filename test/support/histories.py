@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
-from relay_autotune.experiment.oscillation import MOST_BORNE
-from relay_autotune.experiment.procedure import KICK_LIMIT, KICK_SETTLINGS
+from relay_autotune.experiment.phases import KICK_LIMIT, KICK_SETTLINGS
 from relay_autotune.experiment.relay_law import OVERDUE, OVERDUE_SAMPLES
 from relay_autotune.experiment.samples import GAP
+from relay_autotune.experiment.switching import MOST_COMPENSATED
 from relay_autotune.record.record import Outcome
 
 HAPPENINGS = (
@@ -220,7 +220,7 @@ class History:
         own = unequal * (3.0 * self.limit.period + rate) + 2.0 * p.extra_delay / self.period
         stay = own + sum(self._lasts(h) for h in self.happenings)
         turns = p.max_cycles + (_GROWTHS if p.finds_amplitude else 1)
-        patience = (1 + MOST_BORNE) * 2.0 * max(10.0 * unequal * stay, OVERDUE_SAMPLES)
+        patience = (1 + MOST_COMPENSATED) * 2.0 * max(10.0 * unequal * stay, OVERDUE_SAMPLES)
         kick = 2.0 * max(KICK_LIMIT / self.period, KICK_SETTLINGS * SETTLING) + 100.0 * stay
         return int(turns * (2.0 * stay + max(OVERDUE * stay, OVERDUE_SAMPLES)) + patience + kick)
 

@@ -14,6 +14,8 @@ from loop_rig import Rig
 from ros_domain import free_domain
 from std_msgs.msg import Float64MultiArray
 
+from relay_autotune.reasons import Code
+
 
 @pytest.fixture
 def loop(tmp_path: Path) -> Iterator[Loop]:
@@ -47,7 +49,7 @@ def test_the_others_hold_what_they_were_told_and_commands_are_repeated(loop: Loo
     count, last = len(loop.commands), loop.commands[-1]
     rig.until(lambda: len(loop.commands) > count + 5, "repeated commands")
     assert set(loop.commands[count : count + 5]) == {last}
-    loop.check_the_end("no measurement on /measurement for")
+    loop.check_the_end(Code.SILENT_SENSOR)
     # ... nor after the tune.
     count = len(loop.messages)
     rig.until(lambda: len(loop.messages) > count + 5, "the safe command, again and again")
@@ -56,5 +58,5 @@ def test_the_others_hold_what_they_were_told_and_commands_are_repeated(loop: Loo
     loop.tune()
     loop.until_it_oscillates(4)
     others.publish(Float64MultiArray(data=[1.0]))
-    loop.check_the_end("the message on other_commands does not fit")
+    loop.check_the_end(Code.OTHERS_UNKNOWN)
     assert "not known" in rig.ask_for_tune().reason

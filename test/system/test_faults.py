@@ -22,6 +22,7 @@ from rclpy.node import Node
 from ros_domain import free_domain
 from std_msgs.msg import Float32, Float64
 
+from relay_autotune.reasons import Code
 from relay_autotune_msgs.msg import RelayExperiment
 
 # Moments of a fault; `benchmarks/fault_table.py` tries two hundred.
@@ -132,7 +133,7 @@ def test_commands_stay_within_their_limits_and_rate(loop: Loop, seed: int) -> No
     loop.tune()
     loop.rig.until(lambda: loop.experiments or loop.commands.count(top) > 60, "the upper limit")
     abort(loop, random)
-    record = loop.check_the_end("aborted on request")
+    record = loop.check_the_end(Code.REQUESTED)
     command = list(record.command)[:-1]
     assert 0.7 <= min(command) < max(command) == top
     for k in range(1, len(command)):

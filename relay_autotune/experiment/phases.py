@@ -1,0 +1,312 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""The states of a relay experiment before the relay switches: settling, kick and probe.
+
+A state takes samples. It returns a command for each, or the event that ends it with what it has
+found. :mod:`relay_autotune.experiment.experiment` has the table of what follows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol
+
+from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.experiment.relay_law import Relay
+from relay_autotune.experiment.samples import Answer, Event, Facts, Left, Setup, failed
+from relay_autotune.experiment.settling import (
+    LAST_LOOK,
+    LAST_LOOK_SAMPLES,
+    NOISE_SAMPLES,
+    DirectionWatch,
+    ResponseDetector,
+    RestState,
+    RestWatch,
+    Settling,
+    rest_state,
+)
+from relay_autotune.reasons import Code
+from relay_autotune.text import duration
+
+SETTLING_LIMIT = 600.0
+"""Longest settling without settle_time [s]; or 500 samples, if these take longer."""
+SETTLING_SAMPLES = 500
+KICK_LIMIT = 600.0
+"""Longest wait for a response, and then for the first switch, without max_duration [s]; or 50
+times the settling, if that is longer."""
+KICK_SETTLINGS = 50.0
+
+# Least number of samples for a line and a standard deviation, also with settle_time.
+_LEAST_SETTLING_SAMPLES = 5
+# Multiple of its limit at which a part fails that its own rules did not end.
+_BEYOND = 2.0
+# Least number of samples in an interval of the probe.
+_PROBE_SAMPLES = 2
+# An amplitude that is not given begins to grow after this part of the settling, or a number of
+# samples. Each size lasts as long as all smaller ones together, so that a long dead time does not
+# make the amplitude much too large.
+_GROWTH_SETTLINGS = 0.25
+_GROWTH_SAMPLES = 20
+# Factor of that time for a given amplitude that begins small, which stays small until its
+# response is known.
+_SMALL_STAYS = 10.0
+
+# Cycles that a tune usually takes beyond those that must agree.
+_USUAL_EXTRA = 2
+SMALL_CYCLES = 2
+"""Oscillations that a given amplitude takes longer where it begins small: one, and the way on."""
+
+
+class Phase(Protocol):
+    """A state of an experiment, with the data that only this state needs."""
+
+    @property
+    def command(self) -> float:
+        """The command that answers the sample with which the state began [u]."""
+
+    @property
+    def latest(self) -> float:
+        """Deadline, gaps not counted [s]; inf: max_duration alone limits it."""
+
+    @property
+    def where(self) -> str:
+        """The state as the end of a sentence."""
+
+    def answer(self, t: float, y: float, /) -> Answer:
+        """Take the last sample, its time without gaps [s] and the measurement [y]."""
+
+    def status(self, t: float, y: float, /) -> str:
+        """Say what the state waits for and sees, after the same sample."""
+
+
+def _settling_limit(setup: Setup) -> float:
+    return max(SETTLING_LIMIT, SETTLING_SAMPLES * setup.trace.interval)
+
+
+def kick_limit(setup: Setup, facts: Facts) -> float:
+    """Return the longest wait for a response, and then for the first switch [s]."""
+    if setup.parameters.max_duration > 0.0:
+        return math.inf
+    return max(KICK_LIMIT, KICK_SETTLINGS * facts.settled_at)
+
+
+class Settle:
+    """Hold the baseline until the measurement is steady, or settle_time is over.
+
+    :param setup: of the experiment.
+    :param before: measurements before the first command, where the baseline is the present command
+        [y]; None: the baseline may lead the process elsewhere.
+    """
+
+    where = "while settling"
+
+    def __init__(self, setup: Setup, before: Sequence[float] | None) -> None:
+        self._setup = setup
+        self._settling = Settling()
+        self._watch = None if before is None else RestWatch(before)
+        self.command = setup.baseline
+
+    @property
+    def latest(self) -> float:
+        """Deadline [s]."""
+        if self._setup.parameters.max_duration > 0.0:
+            return math.inf
+        return _BEYOND * (_settling_limit(self._setup) + self._setup.parameters.settle_time)
+
+    def answer(self, t: float, y: float) -> Answer:
+        """Take the last sample."""
+        setup, p, n = self._setup, self._setup.parameters, len(self._setup.trace)
+        baseline = setup.baseline
+        if self._watch is not None and self._watch.leaves(y):
+            rest = self._watch.rested_at
+            return failed(Code.NOT_AT_BASELINE(rest=rest, value=y, time=t, baseline=baseline))
+        if p.settle_time > 0.0:
+            if t < p.settle_time or n < _LEAST_SETTLING_SAMPLES:
+                return baseline
+            # Whatever the rest, since the user chose that time.
+            rest_then = rest_state(*setup.trace.columns(0, n)[:2], n)
+            if not rest_then.is_steady:
+                setup.notes.append(Code.NOTE_NOT_STEADY(motion=str(rest_then)))
+            return self._settled(rest_then)
+        if not self._settling.is_due(n):
+            return baseline
+        found, settled = self._settling.look(*setup.trace.columns(0, n)[:2])
+        # A constant measurement may not have responded to a wrong baseline yet.
+        if settled and (self._watch is None or n >= NOISE_SAMPLES):
+            return self._settled(found)
+        if t > SETTLING_LIMIT and n >= SETTLING_SAMPLES and not p.max_duration:
+            return failed(Code.NOT_STEADY(time=t, motion=str(found)))
+        return baseline
+
+    def _settled(self, rest: RestState) -> Left:
+        p, trace, watch = self._setup.parameters, self._setup.trace, self._watch
+        if watch is not None and watch.has_moved_to(rest.mean):
+            self._setup.notes.append(
+                Code.NOTE_MOVED(
+                    rest=watch.rested_at, value=rest.mean, baseline=self._setup.baseline
+                )
+            )
+        facts = Facts(
+            rest=rest,
+            settled_at=trace.seen[-1],
+            kicked_at=trace.time[-1],
+            setpoint=rest.mean if math.isnan(p.setpoint) else p.setpoint,
+            hysteresis=p.hysteresis if p.hysteresis > 0.0 else 3.0 * rest.noise_std,
+            sign=p.process_gain_sign,
+        )
+        return Left(Event.STEADY, facts)
+
+    def status(self, t: float, _: float) -> str:
+        """Say what it waits for and sees."""
+        p, interval, rest = self._setup.parameters, self._setup.trace.interval, self._settling.rest
+        if p.settle_time > 0.0:
+            return f"settling, {duration(t)} of {duration(p.settle_time)}"
+        end = self._settling.expected_end(interval)
+        about = f" of about {duration(end)}" if end > t else ""
+        now = f"settling, {duration(t)}{about}"
+        if not rest.samples or rest.is_steady:
+            count = round(t / interval) + 1 if interval > 0.0 else 1
+            return f"{now}: sample {count} of at least {NOISE_SAMPLES} for the noise"
+        now += f": still {rest.motion}"
+        if about:
+            return now
+        limit = p.max_duration or _settling_limit(self._setup)
+        return f"{now}, not slower than before; it may take {duration(limit)} in all"
+
+
+class Kick:
+    """Hold one level of the relay until the measurement leaves its rest.
+
+    :param setup: of the experiment.
+    :param facts: with the rest.
+    """
+
+    def __init__(self, setup: Setup, facts: Facts) -> None:
+        self._setup, self._facts = setup, facts
+        self._begun, y = setup.now
+        # With a given sign, kick towards the set-point, unless the measurement is already there.
+        self._is_high = (
+            facts.sign == 0
+            or Relay(facts.sign, facts.setpoint, facts.hysteresis, self._begun, y).is_high
+        )
+        self._detector = ResponseDetector(facts.rest, self._begun)
+        self._limit = kick_limit(setup, facts)
+        self.latest = facts.settled_at + _BEYOND * self._limit
+        """Deadline [s]."""
+        stays = _SMALL_STAYS if setup.levels.from_small else 1.0
+        self._grow_after = stays * max(
+            _GROWTH_SETTLINGS * facts.settled_at, _GROWTH_SAMPLES * setup.trace.interval
+        )
+        self.where = f"while waiting for the measurement to leave its rest {facts.rest.mean:g}"
+
+    @property
+    def command(self) -> float:
+        """The level [u]."""
+        return self._setup.level(is_high=self._is_high)
+
+    def answer(self, t: float, y: float) -> Answer:
+        """Take the last sample."""
+        levels, detector, since = self._setup.levels, self._detector, t - self._begun
+        if detector.add(t, y):
+            if levels.from_small:
+                levels.begin_small()
+            elif levels.can_grow:
+                # A response that only just exceeds the noise says too little.
+                levels.grow()
+            facts = replace(
+                self._facts,
+                side=detector.side,
+                dead_time_seen=detector.last_inside - self._begun,
+                response_time=detector.first_outside - self._begun,
+            )
+            return Left(Event.RESPONSE if facts.sign else Event.UNSIGNED_RESPONSE, facts)
+        if levels.can_grow and since >= self._grow_after:
+            levels.grow()
+            self._grow_after *= 2.0
+        if t - self._facts.settled_at <= self._limit:
+            return self.command
+        rest, band = self._facts.rest.mean, detector.band
+        stayed = {"band": band, "rest": rest} if band else {"still": rest}
+        return failed(
+            Code.NO_RESPONSE(
+                level=self.command, baseline=self._setup.baseline, time=since, **stayed
+            )
+        )
+
+    def status(self, t: float, y: float) -> str:
+        """Say what it waits for and sees."""
+        rest, limit = self._facts.rest.mean, self._facts.settled_at + self._limit - self._begun
+        wait = f", for {duration(limit)} at most" if math.isfinite(limit) else ""
+        return (
+            f"stepped to {self.command:g}, no response after {duration(t - self._begun)}: the "
+            f"measurement {y:.6g} is to leave {rest:.6g} -/+ {self._detector.band:.2g}{wait}"
+        )
+
+
+class Probe:
+    """Hold the high level for a moment, then the baseline, until the sign of the gain is clear.
+
+    :param setup: of the experiment.
+    :param facts: with the response.
+    """
+
+    where = "while finding the sign of the process gain"
+
+    def __init__(self, setup: Setup, facts: Facts) -> None:
+        self._setup, self._facts = setup, facts
+        t, y = setup.now
+        interval = max(facts.response_time, _PROBE_SAMPLES * setup.trace.interval)
+        self._watch = DirectionWatch(interval, t, facts.rest, facts.side)
+        self._watch.add(t, y)
+        self._pulse_end = t + interval
+        looks = max(LAST_LOOK * interval, LAST_LOOK_SAMPLES * setup.trace.interval)
+        self.latest = t + _BEYOND * looks
+        """Deadline [s]."""
+        self.command = setup.levels.high
+
+    def answer(self, t: float, y: float) -> Answer:
+        """Take the last sample."""
+        levels, sign = self._setup.levels, self._watch.add(t, y)
+        if sign == 0:
+            return levels.high if t < self._pulse_end else self._setup.baseline
+        if self._watch.remains < self._facts.rest.noise_std:
+            # The pulse left no deviation: noise had looked like a response.
+            if levels.from_small:
+                levels.begin_larger()
+            return Left(Event.NO_DIRECTION, self._facts)
+        return Left(Event.DIRECTION, replace(self._facts, sign=sign))
+
+    def status(self, t: float, y: float) -> str:
+        """Say what it waits for and sees."""
+        return (
+            f"the measurement went {'up' if self._facts.side > 0 else 'down'} after "
+            f"{duration(self._facts.response_time)}; at {self._setup.trace.command[-1]:g} it is "
+            f"{y:.6g}, and shows whether it stays on that side, for "
+            f"{duration(max(self.latest - t, 0.0))} at most"
+        )
+
+
+def how_long(
+    parameters: ExperimentParameters, interval: float, limit: float, *, from_small: bool = False
+) -> str:
+    """Say how long a tune may take, before it begins.
+
+    :param parameters: the experiment's parameters.
+    :param interval: mean interval of the samples [s]; 0: not known.
+    :param limit: longest settling [s].
+    :param from_small: whether a given amplitude begins at a quarter of that.
+    """
+    if parameters.settle_time > 0.0:
+        settles = f"{duration(parameters.settle_time)} at rest"
+    else:
+        least = NOISE_SAMPLES * interval
+        settles = f"{duration(least)} or more" if least > 0.0 else "some time"
+        settles += f" until the measurement is steady, {duration(limit)} at most"
+    usual = parameters.min_cycles + _USUAL_EXTRA + from_small * SMALL_CYCLES
+    told = f"it takes {settles}, then one step and about {usual} oscillations of the loop"
+    if parameters.max_duration > 0.0:
+        return f"{told}, {duration(parameters.max_duration)} at most in all"
+    return told

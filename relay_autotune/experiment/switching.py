@@ -1,0 +1,632 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""The state of an experiment in which the relay switches: its cycles, or why there are none.
+
+The watches of the switching stand in two lists: those of a sample and those of a cycle. Each
+returns the reason to end, or None.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from relay_autotune.arrays import FloatArray
+from relay_autotune.experiment.faults import (
+    TELL,
+    RunawayWatch,
+    has_moved,
+    is_growing,
+    why_no_return,
+    why_noise_alone,
+)
+from relay_autotune.experiment.phases import kick_limit
+from relay_autotune.experiment.relay_law import (
+    DwellFilter,
+    DwellLimit,
+    Levels,
+    Relay,
+    ample_swing,
+    clear_swing,
+)
+from relay_autotune.experiment.samples import Answer, Ended, Facts, Setup, State, failed
+from relay_autotune.reasons import Code, Reason, Value
+from relay_autotune.record.cycles import MIN_CYCLES, cycle_from_samples, next_cycle
+from relay_autotune.record.record import Cycle
+from relay_autotune.text import duration
+
+# Two instants that differ by less than this part of the sample interval are equal.
+_ROUNDING = 1e-6
+
+# The share of the high level in a period is known when two cycles agree within the first number; a
+# later change by more than the second number means a load. A load that stops the oscillation is
+# compensated by shifts of a part of the amplitude, a limited number at a time.
+_SAME_SHARE, _OTHER_SHARE = 0.03, 0.08
+_MOST_SHIFTS, _SHIFT = 2, 0.7
+MOST_COMPENSATED = 4
+"""Number of stays that may need a shift: a load that comes and goes twice. A process that needs it
+at every turn does not oscillate."""
+_FOLLOWS = 2
+# Ratio of a cycle to the one before beyond which it is no sign of a load yet.
+_ALONE = 4.0
+
+# Part of the limit of a stay that applies after the first whole cycle.
+_LIMIT_IN_CYCLES = 0.4
+
+# The measurement has run away if its distance is this many times the oscillation's, for this many
+# samples, since a sensor has spikes.
+_RUNAWAY, _RUNAWAY_SAMPLES = 30.0, 5
+
+# The switching may last max_cycles plus this many cycles of twice the longest allowed stay. The
+# spare cycles cover those that could not be counted.
+_SPARE_CYCLES = 12
+
+# Chatter: more switches in a cycle than this, and this many times as many as in any cycle before.
+_CHATTER, _CHATTER_RATIO = 40, 10.0
+
+# Fast switching: this many cycles in a row are shorter than this part of the usual cycle.
+_FAST_CYCLES, _FAST = 3, 0.3
+# Or of the last stays at most one lasts half the time that the process took to respond to a kick
+# by the same amplitude: a process cannot answer faster, and noise leaves a long stay in each half
+# cycle.
+_MANY_STAYS, _OF_RESPONSE = 40, 0.5
+# Three stays as long as that show that the time to respond was not that of a gap.
+_LONG_STAYS = 3
+
+# If the levels started at a quarter, the swings are compared after this many cycles, once the
+# swing grows by less than this factor from one cycle to the next.
+_TRIED, _STILL = 2, 1.1
+# A last swing this many times as large as a clear one should have been clear at a quarter, too.
+_CLEARLY = 5.0
+
+# A measurement that did not move for this many stays of the relay does not follow it.
+_STAYS = 2
+
+# Least difference of the periods of two cycles that is told, as a fraction.
+_DIFFER = 0.001
+
+_SIGNS = {1: "positive", -1: "negative"}
+
+
+def usual_period(cycles: Sequence[Cycle]) -> float:
+    """Return the lower quartile of the undisturbed periods [s]; 0 for less than two of them.
+
+    The longer ones may hold an actuator that stuck, and the shortest the begin of fast switching.
+    """
+    clean = sorted(cycle.period for cycle in cycles if not cycle.disturbed)
+    return clean[len(clean) // 4] if len(clean) > 1 else 0.0
+
+
+def _swing(cycle: Cycle) -> float:
+    return cycle.peak_max - cycle.peak_min
+
+
+class _FastWatch:
+    """See that the relay switches faster than the process can make it.
+
+    :param switches: of the relay so far.
+    """
+
+    def __init__(self, switches: int) -> None:
+        self._at_cycle = switches
+        self._most = 0
+        self._answered: deque[bool] = deque(maxlen=_MANY_STAYS)
+        self._long_stays = 0
+
+    def forget_cycle(self, switches: int) -> None:
+        """Begin to count switches anew, since the last cycle does not count."""
+        self._at_cycle = switches
+
+    def stay(self, stay: float, response_time: float, *, known: bool) -> Reason | None:
+        """Take a stay that has ended [s].
+
+        :param stay: its length [s].
+        :param response_time: how long the process took to respond [s].
+        :param known: True if the amplitude is not larger than then.
+        """
+        is_long = stay >= _OF_RESPONSE * response_time
+        if stay > 0.0:  # the clock goes
+            self._answered.append(is_long)
+        self._long_stays += is_long
+        known = known and self._long_stays >= _LONG_STAYS
+        if known and len(self._answered) == _MANY_STAYS and sum(self._answered) <= 1:
+            return Code.FAST_STAYS(stays=_MANY_STAYS, part=_OF_RESPONSE, response=response_time)
+        return None
+
+    def cycle(self, switches: int, cycles: int) -> Reason | None:
+        """Take the number of switches at the end of a cycle."""
+        count, self._at_cycle = switches - self._at_cycle, switches
+        most, self._most = self._most, max(self._most, count)
+        if not most or count <= max(_CHATTER_RATIO * most, _CHATTER):
+            return None
+        return Code.FAST_IN_CYCLE(switches=count, cycles=cycles, most=most)
+
+
+class _Load:
+    """Shift the levels against a load, which changes the mean command that the process needs."""
+
+    def __init__(self, levels: Levels, notes: list[Reason]) -> None:
+        self._levels, self._notes = levels, notes
+        self._share = math.nan
+        self.shifts = 0
+        """Number of shifts in the present stay."""
+        self.compensated = 0
+        """Number of stays that needed one."""
+        self.at = -math.inf
+        """Time of the last one [s]."""
+        self.waits_from = -math.inf
+        """Instant from which the limit of the present stay counts, at the earliest [s]."""
+
+    def shows_in(self, last: Sequence[Cycle]) -> bool:
+        """Compensate a load by the share of the high level; return True if there was one.
+
+        :param last: the last two cycles, or the only one.
+        """
+        share = [c.period_high / c.period if c.period > 0.0 else 0.5 for c in last]
+        if math.isnan(self._share):
+            if len(share) == 2 and abs(share[1] - share[0]) < _SAME_SHARE:
+                self._share = share[1]
+            return False
+        change = share[-1] - self._share
+        # After a disturbed cycle a small change counts too: the rest of the same load.
+        if abs(change) <= (_SAME_SHARE if last[0].disturbed else _OTHER_SHARE):
+            return False
+        self._shift(2.0 * change * self._levels.amplitude)
+        return True
+
+    def may_push(self) -> bool:
+        """Return True if the levels may be shifted for a measurement that does not come back."""
+        return self.shifts < _MOST_SHIFTS if self.shifts else self.compensated < MOST_COMPENSATED
+
+    def push(self, sign: int) -> None:
+        """Shift the levels by a part of the amplitude, up (1) or down (-1)."""
+        self._shift(sign * _SHIFT * self._levels.amplitude)
+
+    def pushed(self, t: float, limit: float) -> None:
+        """Note that the command has moved with the levels, and give it half of a limit again."""
+        self.compensated += not self.shifts
+        self.shifts += 1
+        self.at, self.waits_from = t, t - 0.5 * limit
+
+    def _shift(self, by: float) -> None:
+        self._levels.shift(by)
+        note = Code.NOTE_LOAD()
+        if note not in self._notes:
+            self._notes.append(note)
+
+
+class _Course:
+    """The switching since the relay began, with one amplitude that counts, and one sign.
+
+    :param setup: of the experiment.
+    :param facts: with the band, the sign and the response.
+    :param switches: of the relay before.
+    """
+
+    def __init__(self, setup: Setup, facts: Facts, switches: int) -> None:
+        t, y = setup.now
+        self.relay = Relay(facts.sign, facts.setpoint, facts.hysteresis, t, y)
+        self.is_high = self.relay.is_high
+        """The level in force, later than the relay by the added delay."""
+        self.on_the_way: deque[tuple[float, bool, bool]] = deque()
+        """Switches that are delayed: when, which level, and whether a cycle begins."""
+        self.switched_at: deque[int] = deque(maxlen=_STAYS + 1)
+        """Samples at which it switched last."""
+        self.switches_before = switches
+        self.began = t
+        self.fast = _FastWatch(switches)
+        floor = max(facts.hysteresis, abs(y - facts.setpoint), 3.0 * facts.rest.noise_std)
+        self.runaway = RunawayWatch(floor)
+        self.dwell = DwellLimit(setup.levels.balance)
+        self.stays = DwellFilter(t, facts.response_time)
+        self.answers = False
+        """True if the last stay can be a response of the process."""
+        self.is_lost = False
+        """True while no cycle is recognised."""
+        self.usual = 0.0
+        """Usual period before a cycle was lost [s]; 0: none was."""
+
+
+class Switching:
+    """Answer samples with the relay until its cycles agree, or until there is no oscillation.
+
+    An amplitude that is not given grows from cycle to cycle until the oscillation is large enough;
+    cycles count from then on. A load changes the mean command that the process needs, and with it
+    the half periods; the levels are shifted so that the half periods stay the same.
+
+    :param setup: of the experiment; the relay begins at its last sample.
+    :param facts: with the band, the sign and the response.
+    """
+
+    def __init__(self, setup: Setup, facts: Facts) -> None:
+        self._setup, self.facts = setup, facts
+        self.cycles: tuple[Cycle, ...] = ()
+        """The whole cycles so far."""
+        self.cycle_start: tuple[int, ...] = ()
+        """Index of the first sample of each cycle, as in a record."""
+        self.switches = 0
+        """Number of switches of the relay so far; two of them are a half cycle."""
+        # A sign that was found may have to be reversed.
+        self._is_doubtful = setup.parameters.process_gain_sign == 0
+        self._kick_amplitude = setup.levels.amplitude
+        self._load = _Load(setup.levels, setup.notes)
+        self._furthest = math.inf
+        self._away = 0
+        self._begin()
+
+    @property
+    def command(self) -> float:
+        """The level in force [u]."""
+        return self._setup.level(is_high=self._course.is_high)
+
+    @property
+    def where(self) -> str:
+        """The state as the end of a sentence."""
+        n = len(self.cycles)
+        return f"after {n} whole cycle{'' if n == 1 else 's'}"
+
+    @property
+    def is_tried(self) -> bool:
+        """True unless the levels began small and it is not known yet whether the process follows.
+
+        Until then the cycles may be those of an actuator that is at its ends.
+        """
+        return not self._setup.levels.from_small or len(self.cycles) >= _TRIED
+
+    @property
+    def latest(self) -> float:
+        """Deadline of the switching, unless the limit of a stay grows before [s]."""
+        cycles = self._setup.parameters.max_cycles + _SPARE_CYCLES
+        return self._course.began + 2.0 * cycles * self._longest_limit
+
+    def answer(self, t: float, y: float) -> Answer:
+        """Take the last sample, its time without gaps [s] and the measurement [y]."""
+        course, relay = self._course, self._course.relay
+        if relay.update(t, y):
+            if end := self._switched(t):
+                return end
+        elif t - max(relay.since, self._load.waits_from) > self._limit:
+            if end := self._on_timeout(t, y):
+                return end
+        elif self._runs_away(t, y):
+            over = self._is_doubtful and not self.cycles
+            if end := self._on_timeout(t, y) if over else failed(self._why_lost(t, y)):
+                return end
+        # The course may have begun anew.
+        course = self._course
+        waiting, rounding = course.on_the_way, _ROUNDING * self._setup.trace.interval
+        while waiting and waiting[0][0] <= t + rounding:
+            _, course.is_high, begins = waiting.popleft()
+            if begins and (end := self._begin_cycle()):
+                return end
+        return self.command
+
+    def status(self, t: float, y: float) -> str:
+        """Say how the oscillation goes, after the sample that was answered last."""
+        relay, facts, cycles = self._course.relay, self.facts, self.cycles
+        since, needed = t - relay.since, self._setup.parameters.min_cycles
+        if self._setup.levels.searching:
+            now = "the amplitude is still growing"
+        elif not cycles:
+            now = "no whole cycle yet"
+        elif len(cycles) < needed:
+            now = f"{len(cycles)} of at least {needed} cycles"
+        else:
+            last, before = cycles[-1].period, cycles[-2].period
+            differ = 100.0 * max(abs(last - before) / before if before > 0.0 else 0.0, _DIFFER)
+            now = f"{len(cycles)} cycles, the periods of the last two differ by {differ:.2g} %"
+        longer = ""
+        if cycles and since > cycles[-1].period:
+            longer = f", longer than a cycle took; it may take {duration(self._limit)}"
+        rises = relay.is_high == (facts.sign > 0)
+        target = facts.setpoint + (facts.hysteresis if rises else -facts.hysteresis)
+        return (
+            f"{now}; at {self.command:g} for {duration(since)}{longer}: the measurement "
+            f"{y:.6g} is to {'rise' if rises else 'fall'} to {target:.6g}"
+        )
+
+    # Stays of the relay.
+
+    def _begin(self) -> None:
+        self.cycle_start = ()
+        self._course = _Course(self._setup, self.facts, self.switches)
+        p, self._longest_limit = self._setup.parameters, 0.0
+        self._learn(self.facts.response_time)
+        if not p.max_half_cycle and (p.hysteresis > 0.0 or not math.isnan(p.setpoint)):
+            # The user's set-point decides the distance to the first switch, so the time to respond
+            # gives no limit.
+            self._limit = kick_limit(self._setup, self.facts)
+        self._longest_limit = self._limit
+
+    def _learn(self, stay: float) -> None:
+        """Set the limit of the next stay from one that has ended [s]."""
+        p, interval = self._setup.parameters, self._setup.trace.interval
+        self._course.dwell.learn(stay, interval)
+        limit = self._course.dwell.limit
+        if self.cycles:
+            limit = max(_LIMIT_IN_CYCLES * limit, DwellLimit.LEAST_SAMPLES * interval)
+        self._limit = p.max_half_cycle or limit + 2.0 * p.extra_delay
+        self._longest_limit = max(self._longest_limit, self._limit)
+
+    def _switched(self, t: float) -> Ended | None:
+        """Take a switch of the relay."""
+        course, relay, setup = self._course, self._course.relay, self._setup
+        self.switches += 1
+        # Only a stay without a shift of the levels counts: else each shift would lengthen the
+        # limit of the next stay.
+        was_shifted, self._load.shifts = self._load.shifts > 0, 0
+        course.answers = course.stays.add(
+            t,
+            relay.last_stay,
+            setup.levels.balance,
+            counts=relay.switches > 1 and not was_shifted,
+        )
+        self._learn(0.0 if was_shifted else relay.last_stay)
+        end: Ended | None = None
+        if begins := relay.is_high and course.answers:
+            course.stays.begin(t)
+        elif course.stays.is_overdue(t, setup.trace.interval):
+            end = self._learn_anew()
+        course.on_the_way.append((t + setup.parameters.extra_delay, relay.is_high, begins))
+        course.switched_at.append(len(setup.trace) - 1)
+        end = end or self._look_for_noise()
+        # The course may have begun anew.
+        course, known = self._course, setup.levels.amplitude <= self._kick_amplitude
+        fast = course.fast.stay(course.relay.last_stay, self.facts.response_time, known=known)
+        return end or (failed(fast) if fast else None)
+
+    def _learn_anew(self) -> Ended | None:
+        """Learn the length of a stay again from the relay's present switching, or fail."""
+        course, most = self._course, self._setup.parameters.max_cycles
+        course.usual = course.usual or usual_period(self.cycles)
+        if fast := self._too_fast(2.0 * course.stays.longest, course.usual):
+            return failed(fast)
+        if len(self.cycles) + course.stays.lost >= most:
+            lost = course.stays.lost_for
+            return failed(Code.NO_CLEAR_CYCLE(time=lost, cycles=len(self.cycles), most=most))
+        course.dwell.forget(course.stays.longest)
+        course.is_lost = True
+        return None
+
+    def _look_for_noise(self) -> Ended | None:
+        """Make the amplitude larger, or fail, if the last stays did not move the measurement."""
+        at = self._course.switched_at
+        first, last = at[0], at[-1]
+        if len(at) <= _STAYS or last - first < TELL:
+            return None
+        # Noise may switch the relay many times while the measurement passes the band.
+        seen = self._setup.trace.seen
+        if seen[last] - seen[first] < _STAYS * self.facts.response_time:
+            return None
+        noise = self._noise_alone(first, last)
+        if noise is None:
+            return None
+        if not self._setup.levels.can_grow:
+            return failed(noise)
+        self._setup.levels.grow()
+        self._begin()
+        return None
+
+    def _runs_away(self, t: float, y: float) -> bool:
+        distance = y - self.facts.setpoint
+        if not self.cycles:
+            return self._course.runaway.add(t, distance)
+        self._away = self._away + 1 if abs(distance) > self._furthest else 0
+        return self._away >= _RUNAWAY_SAMPLES
+
+    def _on_timeout(self, t: float, y: float) -> Ended | None:
+        """Fail, unless the amplitude can grow or a doubtful sign can be reversed."""
+        levels, load = self._setup.levels, self._load
+        # A half cycle beyond the noise shows that the process follows the relay both ways.
+        stays = self.switches - self._course.switches_before
+        follows = bool(self.cycles) or (stays >= _FOLLOWS and self._course.answers)
+        # A constant measurement is no response at all; a saturated one still is.
+        moved = self._has_moved()
+        if self._is_doubtful and not follows and moved:
+            self._is_doubtful = False
+            self._setup.notes.append(Code.NOTE_SIGN(sign=_SIGNS[self.facts.sign]))
+            self.facts = replace(self.facts, sign=-self.facts.sign)
+            self._begin()
+            return None
+        if levels.can_grow:
+            levels.grow()
+            self._begin()
+            return None
+        if follows and moved and load.may_push():
+            # It did oscillate before: a load may be too large for one of the levels.
+            before = self.command
+            load.push(1 if self._course.is_high else -1)
+            if self.command != before:
+                load.pushed(t, self._limit)
+                return None
+        return failed(self._why_lost(t, y))
+
+    def _has_moved(self) -> bool:
+        """Return True if the measurement has moved since the command last changed."""
+        return has_moved(self._since(max(self._course.relay.since, self._load.at))[1])
+
+    def _since(self, time: float) -> tuple[FloatArray, FloatArray]:
+        """Return time and measurement since an instant."""
+        trace = self._setup.trace
+        return trace.columns(bisect_left(trace.seen, time), len(trace))[:2]
+
+    def _why_lost(self, t: float, y: float) -> Reason:
+        relay, facts = self._course.relay, self.facts
+        values: dict[str, Value] = {
+            "cycles": len(self.cycles),
+            "value": y,
+            "setpoint": facts.setpoint,
+            "hysteresis": facts.hysteresis,
+            "time": t - relay.since,
+            "sign": _SIGNS[facts.sign],
+        }
+        if self._load.compensated >= MOST_COMPENSATED:
+            values["shifted"] = self._load.compensated
+        if not self._has_moved():
+            return Code.NO_ANSWER(**values)
+        time, measurement = self._since(relay.since)
+        towards = facts.sign if relay.is_high else -facts.sign
+        return why_no_return(time, towards * measurement, facts.rest.noise_std, **values)
+
+    # Cycles.
+
+    def _begin_cycle(self) -> Ended | None:
+        """Take the begin of a cycle, which ends the one before."""
+        course, p = self._course, self._setup.parameters
+        self.cycle_start += (len(self._setup.trace) - 1,)
+        if len(self.cycle_start) < 2:
+            course.fast.forget_cycle(self.switches)
+            return None
+        grown, clipped = self._has_grown()
+        if clipped or grown:
+            course.fast.forget_cycle(self.switches)
+            return failed(clipped) if clipped else None
+        cycle = self._cycle_that_ended()
+        was_lost, course.is_lost = course.is_lost, False
+        if was_lost:
+            cycle = replace(cycle, disturbed=True)
+        self.cycles += (cycle,)
+        for watch in _OF_CYCLES:
+            if why := watch(self):
+                return failed(why)
+        n = len(self.cycles)
+        agreed: dict[str, Value] = {"percent": 100.0 * p.cycle_tolerance}
+        if self._setup.until_converged and cycle.converged:
+            which = f"{n}" if n == p.min_cycles else f"the last {p.min_cycles} of {n}"
+            return self._complete(Code.CYCLES_AGREE(which=which, cycles=n, **agreed))
+        if n + course.stays.lost >= p.max_cycles:
+            more = {"needed": p.min_cycles, **agreed} if self._setup.until_converged else {}
+            return self._complete(Code.MAX_CYCLES(most=p.max_cycles, cycles=n, **more))
+        self._furthest = 0.5 * _RUNAWAY * max(map(_swing, self.cycles))
+        # A cycle much longer than the one before may hold an actuator that stuck; a load would
+        # show in the next cycle, too.
+        is_alone = n > 1 and cycle.period > _ALONE * self.cycles[-2].period
+        if not (was_lost or is_alone) and self._load.shows_in(self.cycles[-2:]):
+            self.cycles = (*self.cycles[:-1], replace(cycle, disturbed=True))
+        return None
+
+    def _has_grown(self) -> tuple[bool, Reason | None]:
+        """Make an amplitude that is not given larger if the last cycle was too small.
+
+        :return: whether it did, and why the actuator must be at its ends.
+        """
+        setup, levels = self._setup, self._setup.levels
+        if not levels.searching:
+            return False, None
+        half_swing, clear, y = self._last_swing()
+        noise = self.facts.rest.noise_std
+        least = setup.parameters.target_amplitude or ample_swing(clear, noise, self._room, y)
+        if not levels.from_small and (why := levels.why_clipped(half_swing, settled=False)):
+            return False, why
+        levels.note_small(half_swing, clear)
+        factor = levels.growth_for(half_swing, least)
+        if factor != 1.0:
+            levels.grow(factor)
+            self.cycle_start = self.cycle_start[-1:]
+            return True, None
+        if half_swing < least and not levels.from_small:
+            setup.notes.append(
+                Code.NOTE_SMALL(amplitude=levels.amplitude, swing=half_swing, least=least)
+            )
+        levels.searching = False
+        return False, None
+
+    def _last_swing(self) -> tuple[float, float, FloatArray]:
+        """Return half the swing over the last cycle, the least that is clear, and its samples."""
+        first, last = self.cycle_start[-2:]
+        y = self._setup.trace.columns(first, last + 1)[1]
+        clear = clear_swing(self.facts.rest.noise_std, self.facts.hysteresis, y)
+        return 0.5 * float(y.max() - y.min()), clear, y
+
+    @property
+    def _room(self) -> float:
+        """Distance of the set-point to the nearest limit of the measurement [y]."""
+        p, middle = self._setup.parameters, self.facts.setpoint
+        room = min(middle - p.measurement_min, p.measurement_max - middle)
+        return min(room, p.max_deviation) if p.max_deviation > 0.0 else room
+
+    def _cycle_that_ended(self) -> Cycle:
+        setup, p, noise = self._setup, self._setup.parameters, self.facts.rest.noise_std
+        first, last = self.cycle_start[-2:]
+        cycle = cycle_from_samples(
+            len(self.cycles),
+            *setup.trace.columns(first, last + 1),
+            middle=setup.baseline + setup.levels.bias,
+            reverse_acting=self.facts.sign < 0,
+        )
+        interval = cycle.period / (last - first)
+        return next_cycle(self.cycles, cycle, interval, noise, p.min_cycles, p.cycle_tolerance)
+
+    # What a cycle shows.
+
+    def _too_fast(self, period: float, usual: float) -> Reason | None:
+        """Return a reason if a period is too short compared with the usual one."""
+        if period >= _FAST * usual:
+            return None
+        return Code.FAST_CYCLES(half=0.5 * period, cycles=len(self.cycles), usual=usual)
+
+    def _fast_cycles(self) -> Reason | None:
+        last = max(c.period for c in self.cycles[-_FAST_CYCLES:])
+        return self._too_fast(
+            last, self._course.usual or usual_period(self.cycles[:-_FAST_CYCLES])
+        )
+
+    def _chatter(self) -> Reason | None:
+        return self._course.fast.cycle(self.switches, len(self.cycles))
+
+    def _growth(self) -> Reason | None:
+        growing = is_growing([*map(_swing, self.cycles)])
+        return Code.GROWING(cycles=len(self.cycles)) if growing else None
+
+    def _clipped(self) -> Reason | None:
+        """Return why the actuator is at its ends, once the swing grows no more."""
+        levels = self._setup.levels
+        if not (levels.from_small and self.is_tried):
+            return None
+        before, last = (0.5 * _swing(cycle) for cycle in self.cycles[-2:])
+        return None if last > _STILL * before else levels.why_clipped(last, settled=True)
+
+    def _only_noise(self, least: int = TELL) -> Reason | None:
+        """Return why the last cycles are no oscillation, None if they may be one.
+
+        :param least: number of samples needed for a decision before MIN_CYCLES cycles.
+        """
+        last_cycles = self.cycle_start[-min(len(self.cycles), MIN_CYCLES) - 1 :]
+        first, last = last_cycles[0], last_cycles[-1]
+        few = len(self.cycles) < MIN_CYCLES and last - first < least
+        return None if few else self._noise_alone(first, last)
+
+    def _noise_alone(self, first: int, last: int) -> Reason | None:
+        """Return why the samples first to last - 1 are no oscillation, None if they may be one."""
+        measurement = self._setup.trace.columns(first, last)[1]
+        return why_noise_alone(measurement, self.facts.rest.noise_std, len(self.cycles))
+
+    def _complete(self, why: Reason) -> Ended:
+        """Complete, unless the last cycles may be noise alone."""
+        levels, notes = self._setup.levels, self._setup.notes
+        if noise := self._only_noise(1):
+            return failed(noise)
+        if levels.from_small and not levels.grew_enough:
+            reach: dict[str, Value] = {"low": levels.low, "high": levels.high}
+            half_swing, clear, _ = self._last_swing()
+            # A quarter of this swing would have stood clear of the noise.
+            if not self.cycles[-1].converged or half_swing > _CLEARLY * clear:
+                return failed(Code.REACH_UNKNOWN(**reach, **why.values))
+            notes.append(Code.NOTE_REACH(**reach))
+        if disturbed := sum(cycle.disturbed for cycle in self.cycles):
+            notes.append(Code.NOTE_DISTURBED(disturbed=disturbed, cycles=len(self.cycles)))
+        return Ended(State.COMPLETED, why)
+
+
+_OF_CYCLES: tuple[Callable[[Switching], Reason | None], ...] = (
+    Switching._fast_cycles,
+    Switching._chatter,
+    Switching._growth,
+    Switching._only_noise,
+    Switching._clipped,
+)
+"""What is looked for at the end of each cycle, in this order."""
