@@ -3,16 +3,20 @@
 
 """Exact motion of a process under a held input, and its exact transfer function in z.
 
-The process is a chain of first-order lags (complex constants for oscillating pairs), with the
-held input as one more state in front, so that everything between two changes of the input is
-the free motion of a linear system. The chain's matrix is lower bidiagonal with known
-eigenvalues. Eigenvalues close to one another are kept together in a cluster; between clusters
-the chain is decoupled by Sylvester equations, and within a cluster of centre c
+With the step of a held input as one more pole at s = 0, an output is Y(s) = N(s)/prod (s - p).
+Poles that are close to one another are kept together in a cluster e_1, ..., e_n; F is N over the
+product of all other poles. By Leibniz' rule for divided differences the cluster's share is
+
+    y(t) = sum_k F[e_1, ..., e_k] x_k(t),   x_k(t) = exp(. t)[e_k, ..., e_n],
+
+the partial fractions of equal poles being the case of equal e. The states x_k form a chain,
+x_k' = e_k x_k + x_(k+1), which each step of the input kicks at its end, so that everything between
+two changes of the input is the free motion of a small triangular matrix A. With the centre c,
 
     exp(A t) = exp(c t) sum_p (A - c I)^p t^p / p!,
 
-a sum that ends for equal eigenvalues and converges quickly for close ones. So neither equal,
-nearly equal nor widely spread time constants cost accuracy, and no step size enters.
+a sum that ends for equal poles and converges quickly for close ones. So neither equal, nearly
+equal nor widely spread time constants cost accuracy, and no step size enters.
 
 A command is given at each sample and held until the next one. With the step response s, a dead
 time D and the period h,
@@ -26,45 +30,137 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg.lapack import dtbtrs, ztbtrs
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant
 
-# Real if every time constant is real, which is four times as fast; else complex.
+# Real where poles are real, complex for the upper one of a pair.
 Coordinates = NDArray[Any]
 
-_CLOSE = 0.3
+# Largest distance of the poles of a cluster over their size: beyond, partial fractions lose at
+# most four digits, for up to three poles of each.
+_CLOSE = 0.2
 _EPSILON = 1e-17
 _MOST_TERMS = 120
 _UNDERFLOW = 745.0
 _OVERFLOW = 300.0
-_ONE = np.ones(1)
 
 
 @dataclass(frozen=True)
 class _Cluster:
-    """One group of eigenvalues: centre, place in the chain, motion and output.
+    """Poles close to one another, and what the outputs take of their states.
 
-    ``motion[p]`` is (A - c)^p / (p! scale^p) and ``output[p]`` the rows C times that.
+    :param nodes: the poles, real ones as real numbers.
+    :param centre: their mean.
+    :param place: of their states among all.
+    :param share: 2 for the upper poles of conjugate pairs, of which the outputs take twice the
+        real part; else 1.
+    :param terms: ``(A - c)^p / (p! scale^p)``, shape (terms, n, n); None: the poles are equal.
+    :param scale: unit of the terms [1/s].
+    :param rows: of the outputs, shape (outputs, n).
     """
 
-    centre: complex
-    scale: float
+    nodes: tuple[Any, ...]
+    centre: Any
     place: slice
-    motion: Coordinates
-    output: Coordinates
+    share: float
+    terms: Coordinates | None
+    scale: float
+    rows: Coordinates
+
+    @property
+    def growing(self) -> bool:
+        """True if they lie in the right half plane."""
+        return bool(self.centre.real > 0.0)
+
+    def motions(self, times: FloatArray) -> list[list[Coordinates]]:
+        """Return exp(A t): what state k, then m, has of the state m before.
+
+        :param times: s, of either sign, shape (n,).
+        :return: for each k and m >= k an array of shape (n,); what lies before m = k is not used.
+        """
+        size, centre = len(self.nodes), self.centre
+        rate = centre.real
+        if rate and (self.terms is not None or rate > 0.0):
+            # Beyond these times the exponential is practically zero or infinite, and its product
+            # with a large power would be nan.
+            times = np.clip(times, *sorted((-_UNDERFLOW / rate, _OVERFLOW / rate)))
+        decay = np.exp(centre * times) if centre != 0.0 else np.ones(times.size)
+        if self.terms is None:
+            powers = [decay]
+            for j in range(1, size):
+                powers.append(powers[-1] * times / j)
+            return [[powers[max(m - k, 0)] for m in range(size)] for k in range(size)]
+        x = (times * self.scale) ** np.arange(self.terms.shape[0])[:, None]
+        flat = self.terms.reshape(self.terms.shape[0], -1)
+        return list((flat.T @ x * decay).reshape(size, size, -1))
+
+    def states(self, changes: FloatArray, steps: FloatArray, *, backward: bool) -> Coordinates:
+        """Return the states just after each change of the input, shape (n, m)."""
+        if not (backward and self.growing):
+            return self._followed(np.diff(changes), steps)
+        # Backward in time, each step is undone before the earlier one is reached.
+        before = self._followed(np.diff(changes[::-1]), -steps[::-1])[:, ::-1]
+        before[-1] += steps
+        return before
+
+    def _followed(self, gaps: FloatArray, kicks: FloatArray) -> Coordinates:
+        moved = self.motions(gaps)
+        size = len(self.nodes)
+        states = np.zeros((size, kicks.size), dtype=np.result_type(moved[0][0], kicks))
+        for k in range(size - 1, -1, -1):
+            drive = np.zeros(kicks.size, dtype=states.dtype)
+            if k == size - 1:
+                drive[:] = kicks
+            for m in range(k + 1, size):
+                drive[1:] += moved[k][m] * states[m, :-1]
+            states[k] = recursion(moved[k][k], drive)
+        return states
+
+    def transform(self, z: ComplexArray, first: float, period: float) -> ComplexArray:
+        """Return the z-transform of what the states add to the first output after a unit step."""
+        begin, move = (self.matrix(t) for t in (first, period))
+        matrices = np.eye(len(self.nodes)) - move / z[:, None, None]
+        start = np.broadcast_to(begin[:, -1], (z.size, len(self.nodes)))
+        # A product of matrices would wake the threads of BLAS.
+        moved = np.linalg.solve(matrices, start[..., None])[..., 0]
+        return np.asarray(np.einsum("ns,s->n", moved, self.rows[0]))
+
+    def matrix(self, time: float) -> Coordinates:
+        """Return exp(A t) for one time."""
+        moved = self.motions(np.array([time]))
+        return np.triu([[entry[0] for entry in row] for row in moved])
 
 
-def _group(eigenvalues: list[complex], horizon: float) -> list[list[complex]]:
+def recursion(decay: Coordinates, drive: Coordinates) -> Coordinates:
+    """Return ``x_k = decay_(k-1) x_(k-1) + drive_k``, a triangular system of two bands.
+
+    :param decay: of magnitude at most 1, shape (m - 1,).
+    :param drive: shape (m,).
+    """
+    # Each column of the bands holds a diagonal element, and what the next x takes of this one.
+    bands = np.ones((drive.size, 2), dtype=decay.dtype).T
+    bands[1, :-1] = -decay
+    solve = ztbtrs if np.iscomplexobj(decay) else dtbtrs
+    found: Coordinates = solve(bands, drive[:, None], uplo="L", diag="U")[0][:, 0]
+    return found
+
+
+def _groups(poles: list[complex], horizon: float) -> list[list[complex]]:
+    """Return poles of the upper half plane in groups; with a real one near, also their mirrors."""
     groups: list[list[complex]] = []
-    for value in sorted(eigenvalues, key=lambda e: (abs(e), e.real, e.imag)):
+    for value in sorted(poles, key=lambda e: (abs(e), e.real, e.imag)):
+        if value.imag < 0.0:
+            continue
         for group in groups:
             centre = sum(group) / len(group)
             near = _CLOSE * min(abs(value.real), abs(centre.real))
@@ -73,15 +169,18 @@ def _group(eigenvalues: list[complex], horizon: float) -> list[list[complex]]:
                 break
         else:
             groups.append([value])
+    for group in groups:
+        pairs = [e for e in group if e.imag]
+        flat = (2.0 * e.imag <= max(_CLOSE * abs(e.real), 2.0 / horizon) for e in pairs)
+        if pairs and (len(pairs) < len(group) or any(flat)):
+            group += [e.conjugate() for e in pairs]
     return groups
 
 
-def _terms(group: list[complex], centre: complex, horizon: float) -> int:
+def _term_count(group: list[complex], centre: complex, horizon: float) -> int:
     """Return the number of terms after which the cluster's sum is exact to rounding."""
     size = len(group)
     radius = max(abs(e - centre) for e in group)
-    if radius == 0.0:
-        return size
     decay = radius / abs(centre.real) if centre.real < 0.0 else math.inf
     reach = min(radius * horizon, 64.0)
     for extra in range(1, _MOST_TERMS - size):
@@ -92,40 +191,53 @@ def _terms(group: list[complex], centre: complex, horizon: float) -> int:
     return _MOST_TERMS
 
 
-def _divide(rows: Coordinates, top: complex, constant: complex) -> tuple[Coordinates, Coordinates]:
-    """Divide polynomials, lowest power first in shape (p, n), by ``top s + constant``.
-
-    :return: quotients, shape (p, n - 1), and remainders, shape (p,).
-    """
-    quotient = np.zeros_like(rows[:, 1:])
-    carried = np.zeros_like(rows[:, 0])
-    for power in range(rows.shape[1] - 1, 0, -1):
-        carried = (rows[:, power] - constant * carried) / top
-        quotient[:, power - 1] = carried
-    return quotient, rows[:, 0] - constant * carried
+def _terms(nodes: list[complex], centre: complex, scale: float, count: int) -> Coordinates:
+    offset = (np.diag(nodes) - centre * np.eye(len(nodes)) + np.eye(len(nodes), k=1)) / scale
+    powers = [np.eye(len(nodes), dtype=offset.dtype)]
+    for p in range(1, count):
+        powers.append(powers[-1] @ offset / p)
+    return np.array(powers)
 
 
-def _sylvester(a: Coordinates, b: Coordinates, right: Coordinates) -> Coordinates:
-    """Solve ``a x - x b = right`` for small blocks."""
-    rows, columns = right.shape
-    # The same operator as with np.kron, but many times as fast.
-    operator = np.zeros((rows, columns, rows, columns), dtype=right.dtype)
-    for k in range(columns):
-        operator[:, k, :, k] = a
-    for k in range(rows):
-        operator[k, :, k, :] -= b.T
-    size = rows * columns
-    solved = np.linalg.solve(operator.reshape(size, size), right.ravel())
-    return np.asarray(solved.reshape(rows, columns))
+def _of_powers(nodes: Sequence[complex], degree: int) -> list[list[complex]]:
+    """Return the divided differences ``s^i[e_1, ..., e_k]`` for i < degree, one row for each."""
+    row = [1.0 + 0j] + [0j] * (len(nodes) - 1)
+    rows = [row]
+    for _ in range(1, degree):
+        row = [e * a + b for e, a, b in zip(nodes, row, [0j, *row[:-1]], strict=True)]
+        rows.append(row)
+    return rows
+
+
+def _of_inverse(nodes: Sequence[complex], others: Sequence[complex]) -> list[complex]:
+    """Return the divided differences ``(1/prod (s - q))[e_1, ..., e_k]``."""
+    found = [1.0 + 0j] + [0j] * (len(nodes) - 1)
+    for q in others:
+        carried = 0j
+        for k, e in enumerate(nodes):
+            carried = (found[k] - carried) / (e - q)
+            found[k] = carried
+    return found
+
+
+def _of_inverses(nodes: Sequence[complex], others: Sequence[complex]) -> ComplexArray:
+    """Return the divided differences ``(1/prod (s - q))[e_j, ..., e_k]``, shape (n, n)."""
+    size = len(nodes)
+    found = np.zeros((size, size), dtype=np.complex128)
+    equal = all(e == nodes[0] for e in nodes)
+    series = _of_inverse(nodes, others)
+    for j in range(size):
+        found[j, j:] = series[: size - j] if equal or j == 0 else _of_inverse(nodes[j:], others)
+    return found
 
 
 class Modes:
-    """Transfer functions of one denominator, without dead time, in decoupled coordinates.
+    """Transfer functions of one denominator, without dead time, by the states of its poles.
 
-    The coordinates z describe state and held input together; they change by
-    :attr:`input_direction` times the step where the input steps.
+    The states describe process and held input together; they change by :attr:`input_direction`
+    times the step where the input steps. They belong to clusters, each with an array of its own.
 
-    :param constants: time constants T of the poles, ``prod(1 + T s)`` [s].
+    :param constants: time constants T of the poles, ``prod(1 + T s)``, pairs complete [s].
     :param integrators: further poles at s = 0.
     :param numerators: of each output, coefficients of powers of s, lowest first, shape (p, d).
     :param horizon: longest time of constant input that will be evaluated [s].
@@ -139,41 +251,44 @@ class Modes:
         numerators: Coordinates,
         horizon: float = math.inf,
     ) -> None:
-        groups = _group([0j, *(-1.0 / t for t in constants), *[0j] * integrators], horizon)
-        # The input comes first in the chain, then the poles of its own cluster.
-        groups.sort(key=lambda g: 0j not in g)
-        groups[0].sort(key=abs)
-        chain = [e for group in groups for e in group]
-        self._dtype: Any = np.float64 if all(e.imag == 0.0 for e in chain) else np.complex128
-        values = self._cast(np.array(chain))
-        couplings = np.where(values == 0.0, 1.0, -values)[1:]
-        a = np.diag(values) + np.diag(couplings, -1)
-        c = self._output_rows(values[1:], self._cast(np.asarray(numerators)))
-
-        self.size = len(chain)
-        places, first = [], 0
-        for group in groups:
-            places.append(slice(first, first + len(group)))
-            first += len(group)
-        v = np.eye(self.size, dtype=self._dtype)
-        for j, place in enumerate(places):
-            for below in places[j + 1 :]:
-                coupling = a[below, : below.start] @ v[: below.start, place]
-                v[below, place] = _sylvester(a[below, below], a[place, place], -coupling)
+        poles = [0j, *[-1.0 / complex(t) for t in constants], *[0j] * integrators]
+        if numerators.shape[1] > len(poles) and bool(np.any(numerators[:, len(poles) :])):
+            raise ModelError("a process has at least as many poles as zeros")
+        lead = math.prod((complex(t) for t in constants), start=1.0 + 0j)
+        groups = _groups(poles, horizon)
+        every = [
+            e
+            for group in groups
+            for pole in group
+            for e in ([pole, pole.conjugate()] if _is_upper(group) else [pole])
+        ]
         self._clusters: list[_Cluster] = []
-        for group, place in zip(groups, places, strict=True):
-            centre = group[0] if all(e == group[0] for e in group) else sum(group) / len(group)
+        first = 0
+        for group in groups:
+            upper = _is_upper(group)
+            equal = all(e == group[0] for e in group)
+            centre = group[0] if equal else sum(group) / len(group)
+            others = list(every)
+            for e in group:
+                others.remove(e)
+            size = len(group)
+            degree = numerators.shape[1]
+            rows = numerators @ np.array(_of_powers(group, degree)) @ _of_inverses(group, others)
+            rows = rows / lead
+            real = all(e.imag == 0.0 for e in group)
+            count = 0 if equal else _term_count(group, centre, horizon)
             scale = abs(centre) or 1.0
-            offset = a[place, place] - self._cast(np.asarray(centre)) * np.eye(len(group))
-            power = np.eye(len(group), dtype=self._dtype)
-            motion = [power]
-            for p in range(1, _terms(group, centre, horizon)):
-                power = power @ offset / (p * scale)
-                motion.append(power)
-            stack = np.array(motion)
-            rows = c @ v[:, place]
-            self._clusters.append(_Cluster(complex(centre), scale, place, stack, rows @ stack))
-        self.input_direction = np.linalg.solve(v, np.eye(self.size)[:, 0])
+            terms = None if equal else _terms(group, centre, scale, count)
+            if real:
+                rows, centre = np.ascontiguousarray(rows.real), centre.real
+                terms = None if terms is None else np.ascontiguousarray(terms.real)
+            place = slice(first, first + size)
+            share = 2.0 if upper else 1.0
+            self._clusters.append(_Cluster(tuple(group), centre, place, share, terms, scale, rows))
+            first = place.stop
+        self.size = first
+        self.input_direction = np.zeros(first)
+        self.input_direction[[c.place.stop - 1 for c in self._clusters]] = 1.0
 
     @classmethod
     def of(cls, model: TransferFunction, horizon: float = math.inf) -> Modes:
@@ -188,78 +303,54 @@ class Modes:
         numerator = np.array(model.numerator[::-1])[None, :]
         return cls(model.time_constants, model.integrators, numerator, horizon)
 
-    def _cast(self, array: Coordinates) -> Coordinates:
-        return np.ascontiguousarray(array.real if self._dtype is np.float64 else array)
-
-    def _output_rows(self, eigenvalues: Coordinates, numerators: Coordinates) -> Coordinates:
-        """Return the weights of the chain's states for each numerator.
-
-        State i is the input over the product of the first i factors, so dividing the numerator
-        by the last factor leaves that state's weight as remainder, and so on down the chain.
-        """
-        row = np.zeros((numerators.shape[0], eigenvalues.size + 1), dtype=self._dtype)
-        rest = numerators.astype(self._dtype)
-        for i in range(eigenvalues.size, 0, -1):
-            e = eigenvalues[i - 1]
-            top, constant = (1.0, 0.0) if e == 0.0 else (-1.0 / e, 1.0)
-            rest, row[:, i] = _divide(rest, top, constant)
-            if rest.shape[1] == 0:
-                return row
-        if rest.shape[1] > 1 and bool(np.any(rest[:, 1:])):
-            raise ModelError("a process has at least as many poles as zeros")
-        row[:, 0] = rest[:, 0]
-        return row
-
-    def rest(self) -> Coordinates:
-        """Return the coordinates of the process at rest with zero input."""
-        return np.zeros(self.size, dtype=self._dtype)
-
     @property
-    def growing(self) -> NDArray[np.bool_]:
-        """Which coordinates belong to poles in the right half plane, shape (size,)."""
-        found = np.zeros(self.size, dtype=bool)
-        for cluster in self._clusters:
-            found[cluster.place] = cluster.centre.real > 0.0
+    def rates(self) -> Modes:
+        """The same states with the rates of the outputs as outputs."""
+        found = copy(self)
+        found._clusters = [
+            replace(c, rows=c.rows @ (np.diag(c.nodes) + np.eye(len(c.nodes), k=1)))
+            for c in self._clusters
+        ]
         return found
 
-    def propagators(self, times: FloatArray) -> Coordinates:
-        """Return the matrices that move the coordinates on by each time.
+    def rest(self) -> Coordinates:
+        """Return the states of the process at rest with zero input, shape (size,)."""
+        return np.zeros(self.size, dtype=np.complex128)
 
-        :param times: s, of either sign, shape (m,).
-        :return: block diagonal, shape (m, size, size).
+    def split(self, z: Coordinates) -> list[Coordinates]:
+        """Return states by cluster, as :meth:`outputs` takes them.
+
+        :param z: shape (size,).
         """
-        moved = np.zeros((times.size, self.size, self.size), dtype=self._dtype)
+        return [
+            (z[c.place] if np.iscomplexobj(c.rows) else z[c.place].real)[:, None]
+            for c in self._clusters
+        ]
+
+    def size_of(self, states: Sequence[Coordinates]) -> float:
+        """Return the sum of the magnitudes of which the first output is the sum."""
+        parts = zip(self._clusters, states, strict=True)
+        return sum(c.share * float(np.abs(c.rows[0]) @ np.abs(own[:, 0])) for c, own in parts)
+
+    def propagator(self, time: float) -> Coordinates:
+        """Return the matrix that moves the states on by a time.
+
+        :param time: s, of either sign.
+        :return: block diagonal, shape (size, size).
+        """
+        moved = np.zeros((self.size, self.size), dtype=np.complex128)
         for cluster in self._clusters:
-            factors, x = self._factors(cluster, times)
-            total = np.broadcast_to(cluster.motion[-1], (times.size, *cluster.motion[-1].shape))
-            for matrix in cluster.motion[-2::-1]:
-                total = total * x[:, None, None] + matrix
-            moved[:, cluster.place, cluster.place] = total * factors[:, None, None]
+            moved[cluster.place, cluster.place] = cluster.matrix(time)
         return moved
 
-    def _factors(self, cluster: _Cluster, times: FloatArray) -> tuple[Coordinates, FloatArray]:
-        """Return exp(centre t), and t in units of the cluster."""
-        x = times * cluster.scale
-        if cluster.centre == 0j:
-            return _ONE, x
-        centre = cluster.centre / cluster.scale
-        if centre.real != 0.0:
-            # Limit t: beyond these times the exponential is practically zero or infinite, and the
-            # product with a large power would be nan.
-            low, high = sorted((-_UNDERFLOW / centre.real, _OVERFLOW / centre.real))
-            x = np.minimum(np.maximum(x, low), high)
-        return np.exp((centre.real if self._dtype is np.float64 else centre) * x), x
-
     def move(self, z: Coordinates, time: float) -> Coordinates:
-        """Return the coordinates ``time`` [s] later, with the input held.
+        """Return the states ``time`` [s] later, with the input held.
 
-        :param z: coordinates, shape (size,).
+        :param z: states, shape (size,).
         """
-        return np.asarray(self.propagators(np.array([time]))[0] @ z)
+        return np.asarray(self.propagator(time) @ z)
 
-    def step_transform(
-        self, z: NDArray[np.complexfloating[Any, Any]], first: float, period: float
-    ) -> NDArray[np.complexfloating[Any, Any]]:
+    def step_transform(self, z: ComplexArray, first: float, period: float) -> ComplexArray:
         """Return the z-transform of the first output after a unit step of the input.
 
         ``sum_n s(first + n period) z^-n``, s being the step response.
@@ -268,53 +359,61 @@ class Modes:
         :param first: time of the first sample after the step [s].
         :param period: of the samples [s].
         """
-        begin, move = self.propagators(np.array([first, period]))
-        row = np.concatenate([cluster.output[0, 0] for cluster in self._clusters])
-        matrices = np.eye(self.size) - move / z[:, None, None]
-        start = np.broadcast_to(begin @ self.input_direction, (z.size, self.size))
-        # A product of matrices would wake the threads of BLAS.
-        moved = np.linalg.solve(matrices, start[..., None])[..., 0]
-        return np.asarray(np.einsum("ns,s->n", moved, row))
+        total = np.zeros(z.size, dtype=np.complex128)
+        for cluster in self._clusters:
+            total += cluster.transform(z, first, period)
+            if cluster.share == 2.0:
+                total += cluster.transform(z.conj(), first, period).conj()
+        return total
 
-    def weights(self, z: Coordinates) -> list[Coordinates]:
-        """Return, for each cluster, the coefficients of the outputs' polynomials.
+    def states(
+        self, changes: FloatArray, steps: FloatArray, *, backward: bool = False
+    ) -> list[Coordinates]:
+        """Return the states just after each change of the input, from rest before the first.
 
-        :param z: coordinates, shape (..., size).
-        :return: shapes (..., terms, p).
+        :param changes: instants of the changes of the delayed input [s], shape (m,).
+        :param steps: height of each change, shape (m,).
+        :param backward: True: growing states are followed backward, from zero just after the last
+            change, so that they stay bounded; their true motion differs by a multiple of their
+            own free motion.
+        :return: of each cluster, shapes (n, m).
         """
-        return [
-            np.einsum("tps,...s->...tp", cluster.output, z[..., cluster.place])
-            for cluster in self._clusters
-        ]
+        return [c.states(changes, steps, backward=backward) for c in self._clusters]
 
-    def outputs(self, weights: list[Coordinates], time: FloatArray) -> FloatArray:
-        """Return the outputs ``time`` after the coordinates that gave ``weights``.
+    def outputs(
+        self,
+        states: Sequence[Coordinates],
+        time: FloatArray,
+        segment: NDArray[np.int64] | None = None,
+    ) -> FloatArray:
+        """Return the outputs some time after given states.
 
-        :param weights: from :meth:`weights`, each of shape (terms, p) or (n, terms, p).
-        :param time: s, shape (n,).
-        :return: shape (n, p).
+        :param states: of each cluster, shapes (n, m).
+        :param time: since these states [s], shape (k,).
+        :param segment: which of the states, shape (k,); None: the first one.
+        :return: shape (p, k).
         """
-        y = np.zeros((time.size, weights[0].shape[-1]))
-        for cluster, w in zip(self._clusters, weights, strict=True):
-            factors, x = self._factors(cluster, time)
-            total = w[..., -1, :]
-            for p in range(w.shape[-2] - 2, -1, -1):
-                total = total * x[:, None] + w[..., p, :]
-            y += (total * factors[:, None]).real
-        return y
+        motions: list[FloatArray] = []
+        shares: list[FloatArray] = []
+        for cluster, own in zip(self._clusters, states, strict=True):
+            moved = cluster.motions(time)
+            at = [row[0] if segment is None else row.take(segment) for row in own]
+            for k, rows in enumerate(cluster.rows.T):
+                now = moved[k][k] * at[k]
+                for m in range(k + 1, len(at)):
+                    now = now + moved[k][m] * at[m]
+                if np.iscomplexobj(now):
+                    motions += [now.real, now.imag]
+                    shares += [cluster.share * rows.real, -cluster.share * rows.imag]
+                else:
+                    motions.append(now)
+                    shares.append(rows)
+        return np.stack(shares, axis=1) @ np.stack(motions)
 
-    def slope_weights(self, weights: list[Coordinates]) -> list[Coordinates]:
-        """Return the weights of the outputs' time derivatives.
 
-        :param weights: from :meth:`weights`.
-        """
-        slopes = []
-        for cluster, w in zip(self._clusters, weights, strict=True):
-            derivative = self._cast(np.asarray(cluster.centre)) * w
-            powers = np.arange(1, w.shape[-2]) * cluster.scale
-            derivative[..., :-1, :] += w[..., 1:, :] * powers[:, None]
-            slopes.append(derivative)
-        return slopes
+def _is_upper(group: list[complex]) -> bool:
+    """Return whether a group holds one of each conjugate pair."""
+    return all(e.imag > 0.0 for e in group)
 
 
 def response(model: TransferFunction, time: ArrayLike, u: PiecewiseConstant) -> FloatArray:
@@ -336,47 +435,13 @@ def response(model: TransferFunction, time: ArrayLike, u: PiecewiseConstant) -> 
         return np.zeros(t.shape)
     end = max(float(flat.max()), float(changes[-1]))
     modes = Modes.of(model, horizon=max(end - float(changes[0]), np.finfo(float).tiny))
-    steps = np.diff(u.values, prepend=u.initial)
-    z = coordinates_at_changes(modes, changes, steps)
+    states = modes.states(changes, np.diff(u.values, prepend=u.initial))
     segment = np.searchsorted(changes, flat, side="right") - 1
     after = segment >= 0
     y = np.zeros(flat.shape)
     index = segment[after]
-    weights = [w[index] for w in modes.weights(z)]
-    y[after] = modes.outputs(weights, flat[after] - changes[index])[:, 0]
+    y[after] = modes.outputs(states, flat[after] - changes[index], index)[0]
     return y.reshape(t.shape)
-
-
-def coordinates_at_changes(
-    modes: Modes, changes: FloatArray, steps: FloatArray, *, backward: bool = False
-) -> Coordinates:
-    """Return the coordinates just after each change of the input, from rest before the first.
-
-    :param modes: the process.
-    :param changes: instants of the changes of the delayed input [s], shape (m,).
-    :param steps: height of each change, shape (m,).
-    :param backward: True: the growing modes are followed backward, from zero just after the last
-        change, so that they stay bounded; their true motion differs by a multiple of their own
-        free motion.
-    :return: shape (m, modes.size).
-    """
-    forward = modes.propagators(np.diff(changes))
-    growing = modes.growing
-    backward = backward and bool(np.any(growing))
-    if backward:
-        # The growing modes are followed backward below.
-        forward[:, growing, :] = 0.0
-    kicks = steps[:, None] * modes.input_direction
-    z = np.empty((changes.size, modes.size), dtype=np.result_type(forward, kicks))
-    z[0] = kicks[0]
-    for k in range(1, changes.size):
-        z[k] = forward[k - 1] @ z[k - 1] + kicks[k]
-    if backward:
-        back = modes.propagators(-np.diff(changes))
-        z[-1, growing] = 0.0
-        for k in range(changes.size - 1, 0, -1):
-            z[k - 1, growing] = (back[k - 1] @ (z[k] - kicks[k]))[growing]
-    return z
 
 
 # A dead time of a whole number of periods is recognised in spite of this relative rounding.

@@ -56,14 +56,15 @@ class HalfCycle:
         horizon = max(len(self._poles), 2) * half_period
         self._modes = modes = Modes.of(model, horizon)
         kick = 2.0 * amplitude * model.process_sign * modes.input_direction
-        whole, early, late = modes.propagators(
-            np.array([half_period, model.dead_time, half_period - model.dead_time])
+        whole, early, late = (
+            modes.propagator(t)
+            for t in (half_period, model.dead_time, half_period - model.dead_time)
         )
         before = np.linalg.solve(whole + np.eye(modes.size), late @ kick)
         after = early @ before - kick
-        self._weights = modes.weights(before), modes.weights(after)
-        self._slopes = tuple(modes.slope_weights(w) for w in self._weights)
-        self._rates = modes.slope_weights(modes.weights(late @ after))
+        self._states = modes.split(before), modes.split(after)
+        self._later = modes.split(late @ after)
+        self._rates = modes.rates
 
     def __call__(self, time: FloatArray) -> FloatArray:
         """Return the output's deviation at times after the switch.
@@ -71,7 +72,7 @@ class HalfCycle:
         :param time: s, shape (n,).
         :return: y, shape (n,).
         """
-        return self._unfolded(time, *self._weights)
+        return self._unfolded(time, self._modes)
 
     def slope(self, time: FloatArray) -> FloatArray:
         """Return the rate of the output at times after the switch.
@@ -79,18 +80,17 @@ class HalfCycle:
         :param time: s, shape (n,).
         :return: y/s, shape (n,).
         """
-        return self._unfolded(time, *self._slopes)
+        return self._unfolded(time, self._rates)
 
-    def _unfolded(
-        self, time: FloatArray, before: list[Coordinates], after: list[Coordinates]
-    ) -> FloatArray:
+    def _unfolded(self, time: FloatArray, modes: Modes) -> FloatArray:
+        before, after = self._states
         turns = np.floor(time / self.half_period)
         within = time - turns * self.half_period
         early = within < self.dead_time
         y = np.where(
             early,
-            self._modes.outputs(before, np.where(early, within, 0.0))[:, 0],
-            self._modes.outputs(after, np.where(early, 0.0, within - self.dead_time))[:, 0],
+            modes.outputs(before, np.where(early, within, 0.0))[0],
+            modes.outputs(after, np.where(early, 0.0, within - self.dead_time))[0],
         )
         return np.asarray(np.where(turns % 2.0 == 0.0, y, -y))
 
@@ -111,7 +111,7 @@ class HalfCycle:
         if n < 2:
             return 0.0
         at = np.arange(n, dtype=np.float64) * self.half_period
-        rates = self._modes.outputs(self._rates, at)[:, 0]
+        rates = self._rates.outputs(self._later, at)[0]
         denominator = np.ones(1, dtype=np.complex128)
         for pole in self._poles:
             denominator = np.convolve(denominator, [1.0, -np.exp(pole * self.half_period)])
@@ -179,20 +179,21 @@ def _root(function: Callable[[float], float], low: float, high: float) -> float:
 class _Segment:
     """The motion between two changes of the delayed input."""
 
-    def __init__(self, modes: Modes, z: Coordinates, level: float, corners: FloatArray) -> None:
-        self.modes, self.z, self.level, self._corners = modes, z, level, corners
-        self.weights = modes.weights(z)
-        self.slopes = modes.slope_weights(self.weights)
+    def __init__(
+        self, modes: Modes, rates: Modes, z: Coordinates, level: float, corners: FloatArray
+    ) -> None:
+        self.modes, self.rates, self.level, self._corners = modes, rates, level, corners
+        self.states = modes.split(z)
         # A smaller difference from a threshold is rounding.
-        size = sum(float(np.abs(w).sum()) for w in self.weights)
+        size = modes.size_of(self.states)
         self.rounding = 8.0 * np.finfo(float).eps * (abs(level) + size)
 
     def output(self, time: ArrayLike) -> FloatArray:
         at = np.atleast_1d(np.asarray(time, dtype=np.float64))
-        return np.asarray(self.level + self.modes.outputs(self.weights, at)[:, 0])
+        return np.asarray(self.level + self.modes.outputs(self.states, at)[0])
 
     def slope(self, time: float) -> float:
-        return float(self.modes.outputs(self.slopes, np.array([time]))[0, 0])
+        return float(self.rates.outputs(self.states, np.array([time]))[0, 0])
 
     def grid(self, length: float) -> FloatArray:
         """Return times dense enough that each cell holds at most one extremum."""
@@ -207,7 +208,7 @@ class _Segment:
 
     def turning_points(self, grid: FloatArray) -> FloatArray:
         """Return the times of the extrema between the grid's ends."""
-        slope = self.modes.outputs(self.slopes, grid)[:, 0]
+        slope = self.rates.outputs(self.states, grid)[0]
         cells = np.flatnonzero(slope[:-1] * slope[1:] < 0.0)
         return np.array([_root(self.slope, grid[i], grid[i + 1]) for i in cells])
 
@@ -294,6 +295,7 @@ def simulate_relay(
     """
     process = replace(model, dead_time=model.dead_time + settings.extra_delay)
     modes = Modes.of(process)
+    rates = modes.rates
     constants = [abs(t) for t in model.time_constants] or [max(process.dead_time, 1e-9)]
     oscillation = max((abs((1.0 / t).imag) for t in model.time_constants), default=0.0)
     corners = np.array([min(constants), oscillation])
@@ -310,7 +312,7 @@ def simulate_relay(
     on_the_way = deque([(process.dead_time, switches[0][1])])
     half = _Half(0.0, is_high)
     halves: list[_Half] = []
-    segment = _Segment(modes, z, level, corners)
+    segment = _Segment(modes, rates, z, level, corners)
     # The half cycle from rest and the one after it come before the first whole cycle.
     while sum(1 for h in halves[1:] if h.level_is_high != direct) <= cycles:
         length = on_the_way[0][0] - now if on_the_way else 60.0 * slowest
@@ -356,7 +358,7 @@ def simulate_relay(
             _, value = on_the_way.popleft()
             z = z + (value - arrived) * modes.input_direction
             arrived = value
-        segment = _Segment(modes, z, level, corners)
+        segment = _Segment(modes, rates, z, level, corners)
     times, levels = np.array([s[0] for s in switches]), np.array([s[1] for s in switches])
     command = PiecewiseConstant(times, levels, settings.baseline)
     known = ~np.isnan(measured)

@@ -95,7 +95,7 @@ class Plant:
         self._dead_time = model.dead_time
         self._modes = Modes.of(model)
         self._z = self._modes.rest()
-        self._weights = self._modes.weights(self._z)
+        self._states = self._modes.split(self._z)
         self._since = 0.0
         self._command = initial_command
         self._arrived = initial_command
@@ -117,12 +117,12 @@ class Plant:
         while self._on_the_way and self._on_the_way[0][0] <= time:
             self._arrive(*self._on_the_way.popleft())
         self.time = time
-        return float(self._modes.outputs(self._weights, np.array([time - self._since]))[0, 0])
+        return float(self._modes.outputs(self._states, np.array([time - self._since]))[0, 0])
 
     def _arrive(self, time: float, command: float) -> None:
         z = self._modes.move(self._z, time - self._since)
         self._z = z + (command - self._arrived) * self._modes.input_direction
-        self._weights = self._modes.weights(self._z)
+        self._states = self._modes.split(self._z)
         self._since, self._arrived = time, command
 
 

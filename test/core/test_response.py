@@ -57,6 +57,11 @@ MODELS = {
     "fopdt": TransferFunction.fopdt(1.65, 20.0, 10.0),
     "eight equal lags": TransferFunction.lag_n(1.0, 6.0, 8, 0.6),
     "nearly equal lags": TransferFunction(1.0, (), (1.0, 1.0001, 1.1), 0, 0.5),
+    "lags nearly apart": TransferFunction(1.0, (), (1.0, 1.0, 1.11, 1.11, 1.23, 1.23), 0, 0.5),
+    "a pair near a lag": TransferFunction(1.0, (), (2.0, 2.0 + 0.15j, 2.0 - 0.15j), 0, 0.5),
+    "two pairs near each other": TransferFunction(
+        1.0, (), (1 + 1j, 1 - 1j, 1.05 + 1.02j, 1.05 - 1.02j), 1, 0.5
+    ),
     "lags in a ladder": TransferFunction(1.0, (0.3,), (1.0, 1.3, 1.7, 2.2), 0, 0.5),
     "far apart": TransferFunction.sopdt(37.3, (7200.0, 2.0), 1.0),
     "underdamped": TransferFunction.oscillator(1.0, 2.0, 0.05, 0.123456789),
@@ -110,9 +115,11 @@ def test_a_plant_stepped_from_outside_gives_the_same(name):
 def test_order_and_shape_of_the_times_do_not_matter():
     model = MODELS["fopdt"]
     shuffled = np.random.default_rng(1).permutation(TIME)
-    np.testing.assert_array_equal(
+    np.testing.assert_allclose(
         response(model, shuffled.reshape(1, -1), INPUT)[0],
         [response(model, np.array([t]), INPUT)[0] for t in shuffled],
+        rtol=0,
+        atol=1e-15,
     )
 
 

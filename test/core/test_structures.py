@@ -18,7 +18,6 @@ from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.rational import (
     columns_of,
     free_motion,
-    partial_fractions,
     responses,
 )
 from relay_autotune.identification.waveform.starts import is_unseen
@@ -103,14 +102,6 @@ def test_responses_to_a_long_staircase_are_those_of_the_transfer_function(name):
         constants = denominator.constants(theta[:-1])
         model = TransferFunction(1.0, (), constants, denominator.integrators, theta[-1])
         np.testing.assert_allclose(found[0], response(model, TIME, u), atol=1e-9)
-
-
-def test_poles_that_are_close_are_left_to_the_modes():
-    numerator = np.array([[1.0, 0.5]])
-    assert partial_fractions((2.0, 2.0, 3.0), 0, numerator, 50.0) is not None
-    assert partial_fractions((2.0, 2.0, 2.0001), 0, numerator, 50.0) is None
-    # One that is hardly faster than the held input is slow.
-    assert partial_fractions((2.0, 1e4), 0, numerator, 50.0) is None
 
 
 def test_the_closed_form_of_a_lag_is_the_general_one():
