@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.errors import IdentificationError, ModelError
+from relay_autotune.errors import IdentificationError
 from relay_autotune.process.structures import GivenModel, Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import NORMAL_95
@@ -121,29 +121,8 @@ def carried(
     return np.asarray(root.T @ root)
 
 
-# Largest change of a logarithm. Steps for derivatives: their bounds, and their share of a
-# standard deviation.
-_FAR = 50.0
-_STEPS = (1e-7, 1e-2)
-_SHARE = 1e-3
 # Largest change of a logarithm in a model that is drawn.
 _FARTHEST_DRAWN = 20.0
-
-
-@dataclass(frozen=True)
-class Uncertain:
-    """A quantity with its uncertainty.
-
-    :param value: the quantity.
-    :param std: its standard deviation to first order; NaN: not estimated.
-    :param low: lower end of its 95 % interval; NaN: not estimated.
-    :param high: upper end; NaN: not estimated.
-    """
-
-    value: float
-    std: float = math.nan
-    low: float = math.nan
-    high: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,54 +223,6 @@ class Estimate:
             factors = np.exp(np.clip(change, -farthest, farthest))
         moved = np.where(logarithmic, self.values * factors, self.values + change)
         return np.where(logarithmic, moved, np.maximum(moved, self.structure.least))
-
-    def uncertain(
-        self, function: Callable[[TransferFunction], float], quantile: float = NORMAL_95
-    ) -> Uncertain:
-        """Return a function of the model with its 95 % interval.
-
-        With z the parameters, gains and time constants by their logarithms, S their covariance
-        and g the gradient of the function f by z, the variance is g' S g, and the interval
-
-            f(z - q S g/sqrt(g' S g))  to  f(z + q S g/sqrt(g' S g)),
-
-        which is exact for any monotone function of a linear one: it is the usual one for a dead
-        time, and that of the logarithm for a gain or a ratio.
-
-        :param function: of the model, such as ``lambda m: abs(m(1j * 0.3))``; NaN: it has none.
-        :param quantile: half width of the interval of a normal variable in standard deviations.
-        """
-        value = float(function(self.model))
-        if not math.isfinite(value) or not self.known:
-            return Uncertain(value)
-        structure = self.structure
-        spread = self._spread(structure.logarithmic)
-
-        def at(change: FloatArray) -> float:
-            try:
-                return float(
-                    function(structure.build(self._moved(change, _FAR, structure.logarithmic)))
-                )
-            except (ModelError, OverflowError):
-                return math.nan
-
-        part = _SHARE * np.sqrt(np.maximum(np.diag(spread), 0.0))
-        shortest = _STEPS[0] * np.where(self.values == 0.0, 1.0, np.abs(self.values))
-        up = np.where(structure.logarithmic, np.clip(part, *_STEPS), np.maximum(part, shortest))
-        # At a dead time of zero there is one side only.
-        room = np.where(structure.logarithmic, math.inf, self.values - structure.least)
-        gradient = jacobian(at, np.zeros(self.values.size), up, np.minimum(up, room))
-        variance = float(gradient @ spread @ gradient)
-        if not variance >= 0.0:
-            return Uncertain(value)
-        std = math.sqrt(variance)
-        if std == 0.0:
-            return Uncertain(value, 0.0, value, value)
-        along = quantile * (spread @ gradient) / std
-        ends = [at(-along), at(along)]
-        if not all(math.isfinite(e) for e in ends):
-            ends = [value - quantile * std, value + quantile * std]
-        return Uncertain(value, std, min(*ends, value), max(*ends, value))
 
     def ultimate_std(self, gain: float, frequency: float) -> tuple[float, float]:
         """Return the standard deviations of K_u and w_u to first order.

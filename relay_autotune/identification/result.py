@@ -6,14 +6,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.estimate import Estimate, Uncertain
+from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.limit_cycle.fourier import FrequencyPoint
 from relay_autotune.process.transfer_function import TransferFunction, process_text
 from relay_autotune.process.ultimate import ultimate_point
@@ -47,66 +46,10 @@ def is_determined(value: float, low: float, high: float) -> bool:
     return bool(0.5 * (high - low) <= DETERMINED * abs(value))
 
 
-def determined_combinations(
-    found: Estimate, point: tuple[Uncertain, Uncertain]
-) -> tuple[Combination, ...]:
-    """Return the determined combinations of a model that is not determined as a whole.
-
-    :param found: the model with its covariance.
-    :param point: K_u and w_u, whose uncertainty is known better than to first order.
-    """
-    asked: list[tuple[str, str, Uncertain]] = [
-        (name, unit, found.uncertain(function)) for name, unit, function in _asked(found.model)
-    ]
-    if math.isfinite(point[0].value):
-        asked += [("ultimate_gain", "u/y", point[0]), ("ultimate_frequency", "rad/s", point[1])]
-    combinations = (
-        Combination(name, unit, e.value, e.std, e.low, e.high) for name, unit, e in asked
-    )
-    return tuple(c for c in combinations if c.determined)
-
-
 def point_of(model: TransferFunction) -> tuple[float, float]:
     """Return K_u and w_u; NaN where there is none."""
     point = ultimate_point(model)
     return (math.nan, math.nan) if point is None else (point.gain, point.frequency)
-
-
-def _asked(model: TransferFunction) -> list[tuple[str, str, Callable[[TransferFunction], float]]]:
-    """Return names, units and functions of the combinations that may be determined."""
-    lags = len(model.time_constants)
-    found: list[tuple[str, str, Callable[[TransferFunction], float]]] = []
-    per = " s" * (model.integrators + 1)
-    if lags:
-        # Its first slope: a short test of a slow process shows nothing else.
-        found.append(("gain/time_constant", f"y/(u{per})", _slope))
-    if lags > 1:
-        found.append(("gain/product of lags", f"y/(u{' s' * (model.integrators + lags)})", _high))
-    small = lags if model.integrators else lags - 1
-    if small > 0 or model.zeros:
-        found.append(("dead_time + smaller lags", "s", _apparent_dead_time))
-    if lags and model.is_stable:
-        found.append(("dead_time + sum of lags", "s", _residence))
-    return found
-
-
-def _slope(model: TransferFunction) -> float:
-    return abs(model.gain) / max(abs(t) for t in model.time_constants)
-
-
-def _high(model: TransferFunction) -> float:
-    return abs(model.gain) / math.prod(abs(t) for t in model.time_constants)
-
-
-def _apparent_dead_time(model: TransferFunction) -> float:
-    lags = sorted((t.real for t in model.time_constants), key=abs)
-    some = lags if model.integrators else lags[:-1]
-    return model.dead_time + sum(some) - sum(z.real for z in model.zeros)
-
-
-def _residence(model: TransferFunction) -> float:
-    constants = sum(t.real for t in model.time_constants)
-    return model.dead_time + constants - sum(z.real for z in model.zeros)
 
 
 NOT_AT_REST = "the process was not at rest at the baseline when the test began"

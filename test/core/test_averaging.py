@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from relay_autotune.identification.estimate import Estimate
-from relay_autotune.identification.result import Identification, Rival, identified
-from relay_autotune.identification.waveform.findings import averaged_point
+from relay_autotune.identification.result import Identification, identified
+from relay_autotune.identification.waveform.findings import point_stds
 from relay_autotune.identification.waveform.fit_covariance import Fit, Noise, estimate_of
 from relay_autotune.identification.waveform.separable import evaluate, problem_of
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import FOPDT, SOPDT, SOPDT_ZERO, Structure
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import RelaySettings
 
 # 2 s of lag and 2 s of dead time, each gain and constant known to 1 %.
@@ -25,37 +26,23 @@ _VALUES = np.array([1.0, 2.0, 2.0])
 _FOUND = identified("waveform", Estimate.of(FOPDT, _VALUES, np.diag((0.01 * _VALUES) ** 2)))
 
 
-def _second_order(small: float, std: float) -> Rival:
-    """Return a rival with one more lag, which the data cannot tell from dead time."""
-    values = np.array([1.0, 2.0, small, 2.0 - small])
-    known = np.sqrt(np.diag(_FOUND.covariance))
-    root = np.zeros((4, 4))
-    root[0, 0], root[1, 1], root[3, 3] = known
-    root[:, 2] = std * np.array([0.0, 0.0, 1.0, -1.0])
-    return Rival(Estimate.of_root(SOPDT, values, root), 0.3)
+def test_draws_of_one_structure_give_its_own_deviation():
+    own = list(_FOUND.estimate.draws(4000, np.random.default_rng(1)))
+    stds = point_stds(_FOUND, own)
+    expected = (_FOUND.ultimate_gain_std, _FOUND.ultimate_frequency_std)
+    assert stds == pytest.approx(expected, rel=0.05)
 
 
 def test_a_rival_that_differs_widens_the_interval_by_its_distance():
-    plain = _FOUND.ultimate_gain_std
-    rival = _second_order(0.5, 0.01)
-    gain_std, _ = averaged_point(_FOUND, 0.7, [rival])
-    distance = abs(-1.0 / rival.model(1j * _phase_crossover(rival.model)).real)
-    distance -= _FOUND.ultimate_gain
-    assert gain_std == pytest.approx(math.sqrt(plain**2 + 0.3 * distance**2), rel=0.1)
-
-
-def _phase_crossover(model: TransferFunction) -> float:
-    w = np.linspace(0.3, 2.0, 200_001)
-    return float(w[np.argmin(np.abs(model.phase(w) + math.pi))])
-
-
-@pytest.mark.parametrize("std", [0.0, 1.0, 1e2, 1e4, 1e7])
-def test_a_lag_too_small_to_be_seen_leaves_the_interval_as_it_is(std):
-    # A lag of 1 ms is the same as a dead time of 1 ms, however uncertain the first order says
-    # that both are.
-    gain_std, frequency_std = averaged_point(_FOUND, 0.7, [_second_order(1e-3, std)])
-    assert gain_std == pytest.approx(_FOUND.ultimate_gain_std, rel=0.02)
-    assert frequency_std == pytest.approx(_FOUND.ultimate_frequency_std, rel=0.02)
+    own = list(_FOUND.estimate.draws(70, np.random.default_rng(1)))
+    rival = SOPDT.build((1.0, 2.0, 0.5, 1.5))
+    point = ultimate_point(rival)
+    assert point is not None
+    distance = math.log(point.gain / _FOUND.ultimate_gain)
+    plain = point_stds(_FOUND, own)[0] / _FOUND.ultimate_gain
+    gain_std, _ = point_stds(_FOUND, [*own, *[rival] * 30])
+    expected = math.sqrt(0.7 * plain**2 + 0.3 * distance**2)
+    assert gain_std / _FOUND.ultimate_gain == pytest.approx(expected, rel=1e-6)
 
 
 def _fit_of(structure: Structure, theta: np.ndarray, noise: float) -> Identification:

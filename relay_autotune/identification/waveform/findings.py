@@ -27,7 +27,7 @@ from relay_autotune.identification.result import (
     identified,
     point_of,
 )
-from relay_autotune.identification.waveform.candidates import Candidate, support
+from relay_autotune.identification.waveform.candidates import support
 from relay_autotune.identification.waveform.determination import with_what_is_determined
 from relay_autotune.identification.waveform.fit_covariance import (
     Fit,
@@ -48,87 +48,14 @@ from relay_autotune.identification.waveform.separable import (
     left_of,
     refine,
 )
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record
-
-# Largest deviation of a rival's value for which the first order holds: relative to the value, and
-# of a dead time or a zero, in radians at the ultimate frequency.
-_FARTHEST_RATIO = 2.0
-_FARTHEST_PHASE = 1.0
-
-
-def averaged_point(
-    found: Identification, support: float, rivals: Sequence[Rival]
-) -> tuple[float, float]:
-    """Return the standard deviations of K_u and w_u over all structures with support.
-
-    About the chosen model's value x, with the weights w_m of the structures,
-
-        var = sum_m w_m (var_m + (x_m - x)^2)
-
-    (Buckland, Burnham and Augustin 1997): the variance within each structure, and the distance
-    between them.
-
-    :param found: the chosen model.
-    :param support: its weight.
-    :param rivals: those with a covariance count.
-    """
-    own = (found.ultimate_gain, found.ultimate_frequency)
-    stds = (found.ultimate_gain_std, found.ultimate_frequency_std)
-    if not all(math.isfinite(x) for x in (*own, *stds)):
-        return stds
-    total = support
-    sums = [support * std**2 for std in stds]
-    for rival in rivals:
-        root = rival.estimate.root
-        if root is None or not np.all(np.isfinite(root)):
-            continue
-        point = point_of(rival.model)
-        if not math.isfinite(point[0]) or point[0] * own[0] < 0.0:
-            continue
-        theirs = _within_reach(rival.estimate, root, point[1]).ultimate_std(*point)
-        if not all(math.isfinite(s) for s in theirs):
-            continue
-        total += rival.support
-        for k in (0, 1):
-            sums[k] += rival.support * (theirs[k] ** 2 + (point[k] - own[k]) ** 2)
-    if not total > 0.0:
-        return stds
-    return math.sqrt(sums[0] / total), math.sqrt(sums[1] / total)
-
-
-def _within_reach(rival: Estimate, root: FloatArray, frequency: float) -> Estimate:
-    """Return an estimate with its covariance limited to where the first order holds.
-
-    A lag or a zero far below the sampling period can hardly be told from dead time. To first
-    order its standard deviation may then exceed the whole record, and so would that of K_u, a
-    curved function of both. Each value therefore has a prior of covariance L, far wider than that
-    of a value that the data show. With it the covariance S becomes
-    ``(S^-1 + L^-1)^-1 = L^1/2 U s^2/(1 + s^2) U' L^1/2``, with the singular values s of the root
-    of S over that of L.
-
-    :param rival: the estimate.
-    :param root: of its covariance.
-    :param frequency: w_u [rad/s].
-    """
-    phase = _FARTHEST_PHASE / frequency
-    limits = [
-        _FARTHEST_RATIO * abs(value) if parameter.logarithmic else phase
-        for parameter, value in zip(rival.structure.parameters, rival.values, strict=True)
-    ]
-    size = np.maximum(np.array(limits), 1e-12 * phase)
-    axes, std, _ = np.linalg.svd(root / size[:, None], full_matrices=False)
-    root = size[:, None] * axes * (std / np.sqrt(1.0 + std**2))
-    return Estimate.of_root(rival.structure, rival.values, root)
-
 
 _UNEXPLAINED = 1.5
 # Least difference of the effects of commands to either side that is worth a sentence.
 _UNEQUAL = 0.05
 _WORTH_TELLING = 1e-3
-# Rivals with more support than this have a share in the uncertainty of K_u and w_u.
-_WORTH_COUNTING = 1e-2
-_MOST_COUNTED = 6
 _OPEN = 0.01
 _PREDICTED = 1e-6
 
@@ -175,12 +102,15 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         warnings=warnings,
         fitted=_fitted(records, fit, residual),
     )
-    gain_std = found.ultimate_gain_std / abs(found.ultimate_gain)
-    notes = [disagreeing_point(record, found.model, gain_std) for record in records]
+    gain_std, frequency_std = point_stds(found, allowed.mixture)
+    error = gain_std / abs(found.ultimate_gain)
+    notes = [disagreeing_point(record, found.model, error) for record in records]
     found = replace(found, warnings=(*found.warnings, *dict.fromkeys(n for n in notes if n)))
-    found = _beside_rivals(found, fit, shares, noise)
+    found = _with_rivals(found, fit, shares)
     found = replace(
         found,
+        ultimate_gain_std=gain_std,
+        ultimate_frequency_std=frequency_std,
         draws=allowed.models,
         halves=allowed.halves,
         effects=problem.effects(state.coefficients),
@@ -193,7 +123,25 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
             "changed; intervals are widened to hold both, and gains have to hold on both"
         )
         found = replace(found, warnings=(*found.warnings, told))
-    return with_what_is_determined(found, records, fit, quantile)
+    return with_what_is_determined(found, records, allowed, quantile)
+
+
+def point_stds(found: Identification, mixture: Sequence[TransferFunction]) -> tuple[float, float]:
+    """Return the standard deviations of K_u and w_u over all models that a record allows.
+
+    They are the root mean squares of the logarithms of their ratios to the chosen model's: within
+    each structure, and between them (Buckland, Burnham and Augustin 1997).
+
+    :param found: the chosen model.
+    :param mixture: the models.
+    """
+    own = np.array((found.ultimate_gain, found.ultimate_frequency))
+    ratios = np.array([point_of(m) for m in mixture]).reshape(-1, 2) / own
+    ratios = ratios[np.all(ratios > 0.0, axis=1)]
+    if not ratios.size:
+        return math.nan, math.nan
+    gain_std, frequency_std = np.abs(own) * np.sqrt(np.mean(np.log(ratios) ** 2, axis=0))
+    return float(gain_std), float(frequency_std)
 
 
 def _spread_beside(problem: Problem, state: Trial) -> float:
@@ -235,29 +183,20 @@ def _fitted(records: Sequence[Record], fit: Fit, residual: FloatArray) -> FloatA
     return fitted
 
 
-def _beside_rivals(
-    found: Identification, fit: Fit, shares: Sequence[float], noise: Noise
-) -> Identification:
-    """Add the rivals, and widen the uncertainty of K_u and w_u by theirs."""
+def _with_rivals(found: Identification, fit: Fit, shares: Sequence[float]) -> Identification:
+    """Add the support of the structure, and the other structures that have some."""
     chosen = fit.problem.structure
     own = 0.0
     rivals: list[Rival] = []
     for candidate, share in zip(fit.candidates, shares, strict=True):
-        if (candidate.structure.name, candidate.structure.order) == (chosen.name, chosen.order):
+        structure, state = candidate.structure, candidate.state
+        if (structure.name, structure.order) == (chosen.name, chosen.order):
             own += share
         elif share >= _WORTH_TELLING:
-            counted = share >= _WORTH_COUNTING and len(rivals) < _MOST_COUNTED
-            rival = _rival(candidate, share, fit, noise if counted else None)
-            if rival is not None:
-                rivals.append(rival)
-    gain_std, frequency_std = averaged_point(found, own, rivals)
-    found = replace(
-        found,
-        support=own,
-        rivals=tuple(rivals),
-        ultimate_gain_std=gain_std,
-        ultimate_frequency_std=frequency_std,
-    )
+            read = structure.read(state.theta, fit.scale * state.coefficients)
+            if read is not None:
+                rivals.append(Rival(Estimate.of(*read), share))
+    found = replace(found, support=own, rivals=tuple(rivals))
     stable = [r for r in rivals if r.model.is_stable and r.support > _OPEN]
     if not (found.model.integrators and stable):
         return found
@@ -269,20 +208,6 @@ def _beside_rivals(
         "depend on it"
     )
     return replace(found, warnings=(*found.warnings, told))
-
-
-def _rival(candidate: Candidate, share: float, fit: Fit, noise: Noise | None) -> Rival | None:
-    """Return a rival; with its covariance where the noise is given."""
-    problem, state = candidate.problem, candidate.state
-    if noise is None:
-        read = problem.structure.read(state.theta, fit.scale * state.coefficients)
-        return None if read is None else Rival(Estimate.of(*read), share)
-    found = estimate_of(problem, state, replace(fit, loss="squares"), noise)
-    if found is None or found.root is None:
-        return None
-    # Where samples are many, it was fitted to some of them only.
-    root = found.root * math.sqrt(problem.time.size / fit.problem.time.size)
-    return Rival(Estimate.of_root(found.structure, found.values, root), share)
 
 
 def _prediction(records: Sequence[Record], problem: Problem, state: Trial) -> float:

@@ -33,19 +33,23 @@ from relay_autotune.identification.waveform.separable import (
     left_beside,
     refine,
 )
+from relay_autotune.process.structures import Structure
 from relay_autotune.process.transfer_function import TransferFunction
 
-_MOST_SAMPLES = 1200
+# Samples at which draws are compared with the fit, and those of both halves together.
+_MOST_SAMPLES, _MOST_OF_HALVES = 600, 2400
 _FEWEST = 24
 _STEPS, _HALVINGS, _SETTLED = 10, 4, 1e-3
-# Standard deviations of the prior: of logarithms of times, of a gain relative to its value, of a
-# dead time relative to all times together.
-_TIMES, _GAIN, _DEAD_TIME = 1.0, 0.5, 1.0
+# Standard deviation of the prior of a logarithm; that of a dead time or a zero is all times.
+_LOGARITHM = 1.0
 DRAWS = 100
 _DRAWS_OF_HALF = 40
+# Farthest point of the search in standard deviations of the prior.
 _FARTHEST = 20.0
-# Share of the posterior that is beyond the farthest draw, and tries for each draw.
-_EXCLUDED, _TRIES = 1e-3, 4
+# Tries for each draw.
+_TRIES = 4
+# Share of the posterior that lies farther than a model that the samples exclude.
+_EXCLUDED = 1e-3
 # Draws of each half that differs, and copies of each plain model: more than the share that no
 # promise of the design holds on.
 _SHARE = DRAWS // 10
@@ -59,13 +63,21 @@ _BY_CHANCE = 4.6
 class Posterior:
     """The models that a record allows.
 
-    :param models: drawn from the mixture over all candidates, each as likely as the others.
+    :param models: drawn from the mixture over all candidates, each as likely as the others, and
+        what gains have to hold on besides: either side of an unequal process, both halves of one
+        that changed, a plain model beside one in colour.
+    :param mixture: those of the candidates alone.
+    :param values: of the chosen structure's parameters in its own draws, shape (k, p).
+    :param own: the models of these.
     :param halves: those of each half alone; empty where a half holds too little.
     :param temper: mean square of the difference of the halves over that by chance, at least 1:
         the ratio by which the record's variances are larger than its noise alone explains.
     """
 
     models: tuple[TransferFunction, ...]
+    mixture: tuple[TransferFunction, ...]
+    values: FloatArray
+    own: tuple[TransferFunction, ...]
     halves: tuple[Part, ...] = ()
     temper: float = 1.0
 
@@ -82,23 +94,35 @@ def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: fl
     halves = _halves(fit, inflation, rng)
     temper = max(_apart(halves, frequency) / _BY_CHANCE, 1.0)
     most = _most_left(fit)
+    mixture: list[TransferFunction] = []
     models: list[TransferFunction] = []
+    # The chosen one was fitted to the end.
+    own = _draws(fit.problem, fit.state, fit.scale, inflation * temper, DRAWS, rng)
     for candidate, share in zip(fit.candidates[1:], shares[1:], strict=True):
         problem, state = candidate.problem, candidate.state
         count = round(DRAWS * share)
         if count and _left(problem, state)[0] <= most:
-            models += _draws(problem, state, fit.scale, inflation * temper, count, rng)
-    rest = max(DRAWS - len(models), 1)
-    models = [
-        # The chosen one was fitted to the end.
-        *_draws(fit.problem, fit.state, fit.scale, inflation * temper, rest, rng),
-        *models,
-    ]
+            drawn = _draws(problem, state, fit.scale, inflation * temper, count, rng).models
+            mixture += drawn
+            models += _on_both_sides(drawn, problem, state)
+    rest = own.models[: max(DRAWS - len(mixture), 1)]
+    mixture = [*rest, *mixture]
+    models = [*_on_both_sides(rest, fit.problem, fit.state), *models]
     if temper > 1.0:
         # The process changed from one half to the other: both are among the models.
         models += [m for part in halves for m in part.models[:_SHARE]]
     models += [m for m in _plain(fit) for _ in range(_SHARE)]
-    return Posterior(tuple(models), halves, temper)
+    return Posterior(tuple(models), tuple(mixture), own.values, own.models, halves, temper)
+
+
+def _on_both_sides(
+    models: Sequence[TransferFunction], problem: Problem, state: Trial
+) -> list[TransferFunction]:
+    """Return models with the effects of commands above and below the first one, in turn."""
+    sides = problem.effects(state.coefficients)
+    if not min(sides) > 0.0:
+        return list(models)
+    return [replace(m, gain=m.gain * sides[i // 2 % 2]) for i, m in enumerate(models)]
 
 
 def _plain(fit: Fit) -> list[TransferFunction]:
@@ -140,7 +164,7 @@ def _draws(
     inflation: float,
     count: int,
     rng: np.random.Generator,
-) -> tuple[TransferFunction, ...]:
+) -> _Drawn:
     """Return models drawn from the posterior of some samples about their best fit."""
     few = problem.thinned(_MOST_SAMPLES) if problem.colour is None else problem
     degrees = max(problem.time.size - state.parameters, 1)
@@ -148,13 +172,7 @@ def _draws(
     variance = inflation * state.cost / degrees * few.time.size / problem.time.size
     exact = replace(few, y=state.coefficients @ few.columns(state.theta)[0])
     gain = state.coefficients[: len(problem.structure.powers)]
-    models, _ = _allowed(exact, gain, state.theta, scale, lambda _: variance, count, rng)
-    above, below = problem.effects(state.coefficients)
-    # Gains have to hold on both sides.
-    return tuple(
-        replace(m, gain=m.gain * (above, below)[i % 2]) if min(above, below) > 0.0 else m
-        for i, m in enumerate(models)
-    )
+    return _allowed(exact, gain, state.theta, scale, lambda _: variance, count, rng)
 
 
 def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part, ...]:
@@ -167,9 +185,9 @@ def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part,
     if len(problem.bounds) > 1 or problem.structure.unstable:
         return ()
     if problem.colour is None:
-        problem = problem.thinned(2 * _MOST_SAMPLES)
+        problem = problem.thinned(_MOST_OF_HALVES)
     gain = state.coefficients[: len(problem.structure.powers)]
-    _, jacobian = _linearised(problem, np.concatenate((gain, state.theta)), gain.size)
+    _, jacobian = _linearised(problem, gain, state.theta)
     size = np.einsum("pn,pn->p", jacobian, jacobian)
     size[size == 0.0] = 1.0
     information = np.cumsum(np.sum(jacobian**2 / size[:, None], axis=0))
@@ -188,8 +206,9 @@ def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part,
             return inflation * float(left @ left) / degrees
 
         found = _allowed(part, gain, state.theta, fit.scale, variance_of, _DRAWS_OF_HALF, rng)
-        if found[0]:
-            parts.append(Part(float(part.time[0]), float(part.time[-1]), *found))
+        if found.models:
+            ends = float(part.time[0]), float(part.time[-1])
+            parts.append(Part(*ends, found.models, found.excludes_known))
     return tuple(parts)
 
 
@@ -216,10 +235,26 @@ def _apart(halves: Sequence[Part], frequency: float) -> float:
 
 
 @dataclass(frozen=True)
+class _Drawn:
+    """Draws from one posterior.
+
+    :param models: each as likely as the others.
+    :param values: of their structure's parameters, shape (k, p).
+    :param excludes_known: True: the samples exclude the estimate that they were asked of.
+    """
+
+    models: tuple[TransferFunction, ...]
+    values: FloatArray
+    excludes_known: bool = False
+
+
+@dataclass(frozen=True)
 class _Point:
     """A model in the search for the most likely one, as the samples and the prior see it.
 
-    :param at: coefficients of its numerator, then theta, shape (p,).
+    :param at: logarithm of its gain, its numerator's further coefficients over the gain, then
+        theta, shape (p,).
+    :param sign: of the gain.
     :param left: its residual, shape (n,).
     :param jacobian: derivatives of the response, shape (p, n).
     :param variance: of the noise that the residual shows.
@@ -227,6 +262,7 @@ class _Point:
     """
 
     at: FloatArray
+    sign: float
     left: FloatArray
     jacobian: FloatArray
     variance: float
@@ -245,8 +281,8 @@ def _allowed(
     noise: Callable[[FloatArray], float],
     count: int,
     rng: np.random.Generator,
-) -> tuple[tuple[TransferFunction, ...], bool]:
-    """Return models drawn from the posterior that some samples give, and if it excludes the known.
+) -> _Drawn:
+    """Return draws from the posterior that some samples give, and if it excludes the known.
 
     :param problem: the samples.
     :param gain: coefficients of the estimate's numerator, shape (k,).
@@ -256,19 +292,31 @@ def _allowed(
     :param count: models to draw.
     :param rng: the source.
     """
-    structure = problem.structure
-    known = np.concatenate((gain, theta))
+    structure, k = problem.structure, gain.size
     slow = float(unit_steps(structure, theta)[-1])
-    weak = _GAIN * np.abs(gain[0]) * slow ** np.arange(gain.size)
-    deviation = np.concatenate((weak, np.full(theta.size - 1, _TIMES), [_DEAD_TIME * slow]))
-    if not np.all(deviation > 0.0):
-        return (), False
-    own = refine(problem, theta, tolerance=TRIAL, most=_STEPS)
+    deviation = np.array([_LOGARITHM, *[slow] * (k - 1), *[_LOGARITHM] * (theta.size - 1), slow])
+    none = _Drawn((), np.empty((0, 0)))
+    if not (slow > 0.0 and gain[0] != 0.0):
+        return none
 
-    def about(point: FloatArray) -> _Point:
-        left, jacobian = _linearised(problem, point, gain.size)
-        far = float(np.sum(((point - known) / deviation) ** 2))
-        return _Point(point, left, jacobian, max(noise(left), NEGLIGIBLE**2), far)
+    def unpacked(at: FloatArray, sign: float) -> tuple[FloatArray, FloatArray]:
+        return sign * math.exp(at[0]) * np.append(1.0, at[1:k]), at[k:]
+
+    def packed(gain: FloatArray, theta: FloatArray) -> FloatArray:
+        return np.concatenate(([math.log(abs(gain[0]))], gain[1:] / gain[0], theta))
+
+    known = _within_the_record(structure, packed(gain, theta), float(np.ptp(problem.time)))
+
+    def about(at: FloatArray, sign: float) -> _Point:
+        at = np.clip(at, -_FARTHEST * deviation + known, _FARTHEST * deviation + known)
+        at[-1] = max(float(at[-1]), 0.0)
+        coefficients, own = unpacked(at, sign)
+        left, slopes = _linearised(problem, coefficients, own)
+        by_log = coefficients @ slopes[:k]
+        slopes[1:k] *= coefficients[0]
+        slopes[0] = by_log
+        far = float(np.sum(((at - known) / deviation) ** 2))
+        return _Point(at, sign, left, slopes, max(noise(left), NEGLIGIBLE**2), far)
 
     def axes_at(point: _Point) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return singular values of the slopes in units of prior and noise, and their axes."""
@@ -276,11 +324,13 @@ def _allowed(
         axes, values, rows = np.linalg.svd(scaled, full_matrices=False)
         return axes, values, rows
 
-    here = start = about(known)
+    here = start = about(known, math.copysign(1.0, gain[0]))
     # The best fit without the prior may be nearer, but also run off where samples tell little.
-    elsewhere = about(_bounded(np.concatenate((own.coefficients[: gain.size], own.theta))))
-    if elsewhere.cost(here.variance) < here.cost(here.variance):
-        here = elsewhere
+    own = refine(problem, theta, tolerance=TRIAL, most=_STEPS)
+    if own.coefficients[0] != 0.0:
+        at = packed(own.coefficients[:k], own.theta)
+        elsewhere = about(at, math.copysign(1.0, own.coefficients[0]))
+        here = min(here, elsewhere, key=lambda p: p.cost(start.variance))
     for _ in range(_STEPS):
         axes, values, rows = axes_at(here)
         along = values * (rows @ here.left) / math.sqrt(here.variance)
@@ -288,7 +338,7 @@ def _allowed(
         step = deviation * (axes @ (along / (1.0 + values**2)))
         cost = here.cost(here.variance)
         for _ in range(_HALVINGS):
-            trial = about(_bounded(here.at + step))
+            trial = about(here.at + step, here.sign)
             now = trial.cost(here.variance)
             if now < cost:
                 break
@@ -301,48 +351,82 @@ def _allowed(
     axes, values, _ = axes_at(here)
     # The symmetric root, which turns on no sign or order of the axes.
     root = (axes / np.sqrt(1.0 + values**2)) @ axes.T
-    farthest = 2.0 * float(gammaincinv(0.5 * known.size, 1.0 - _EXCLUDED))
-
-    def is_excluded(point: _Point) -> bool:
-        return point.cost(here.variance) - here.cost(here.variance) > farthest
-
+    least = here.cost(here.variance)
     models: list[TransferFunction] = []
-    for _ in range(_TRIES * count):
+    drawn: list[FloatArray] = []
+    for number in range(_TRIES * count):
         if len(models) == count:
             break
-        drawn = _bounded(here.at + deviation * (root @ rng.standard_normal(known.size)))
-        if is_excluded(about(drawn)):
+        if number % count == 0:
+            batch = _normal(count, known.size, rng)
+        normal = batch[number % count]
+        point = about(here.at + deviation * (root @ normal), here.sign)
+        # Density of the posterior over that of the normal distribution about its best point.
+        rise = point.cost(here.variance) - least - float(normal @ normal)
+        if math.log(1.0 - rng.random()) > -0.5 * rise:
             continue
+        coefficients, own_theta = unpacked(point.at, point.sign)
         try:
-            model = structure.model_at(drawn[gain.size :], scale * drawn[: gain.size])
+            model = structure.model_at(own_theta, scale * coefficients)
+            read = structure.read(own_theta, scale * coefficients, like=theta)
         except ModelError:
             continue
-        if model is not None:
+        if model is not None and read is not None:
             models.append(model)
-    return tuple(models), is_excluded(start)
+            drawn.append(read[1])
+    rise = start.cost(here.variance) - least
+    excluded = rise > 2.0 * float(gammaincinv(0.5 * known.size, 1.0 - _EXCLUDED))
+    return _Drawn(tuple(models), np.array(drawn), excluded)
 
 
-def _bounded(point: FloatArray) -> FloatArray:
-    """Return a point with a dead time that is not negative, and finite times."""
-    point = np.clip(point, -1e12, 1e12)
-    point[-1] = max(float(point[-1]), 0.0)
-    return point
+def _within_the_record(structure: Structure, at: FloatArray, length: float) -> FloatArray:
+    """Return a point whose lags are at most as long as the record, with the same first slope.
+
+    A longer one acts as an integrator, however long it is: about an estimate that is too long, the
+    prior would exclude the truth.
+
+    :param structure: the structure.
+    :param at: logarithm of the gain, further coefficients, theta, shape (p,).
+    :param length: of the record [s].
+    """
+    found, first = at.copy(), len(structure.powers)
+    for factor in structure.factors:
+        place = slice(first, first + len(factor.parameters))
+        first = place.stop
+        slowest = max(abs(c) for c in factor.constants(at[place]))
+        beyond = max(math.log(slowest / length), 0.0)
+        found[place] -= beyond / len(factor.parameters)
+        found[0] -= beyond * factor.multiplicity
+    return found
 
 
-def _linearised(problem: Problem, point: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+def _normal(count: int, size: int, rng: np.random.Generator) -> FloatArray:
+    """Return standard normal draws in opposite pairs, with mean 0 and covariance 1 as a sample.
+
+    :param count: of draws.
+    :param size: of each.
+    :param rng: the source.
+    """
+    half = rng.standard_normal((max(count // 2, size), size))
+    values, axes = np.linalg.eigh(half.T @ half / half.shape[0])
+    half = half @ (axes / np.sqrt(values)) @ axes.T
+    return np.stack((half, -half), axis=1).reshape(-1, size)
+
+
+def _linearised(
+    problem: Problem, gain: FloatArray, theta: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return a model's residual and its derivatives, both after the fit of the nuisances.
 
     :param problem: the samples.
-    :param point: coefficients of the numerator, then theta.
-    :param count: of these coefficients.
-    :return: shapes (n,) and (p, n).
+    :param gain: coefficients of the numerator, shape (k,).
+    :param theta: shape (m,).
+    :return: shapes (n,) and (k + m, n).
     """
-    gain = point[:count]
-    theta = np.concatenate((np.clip(point[count:-1], -_FARTHEST, _FARTHEST), point[-1:]))
     columns, derivatives = problem.columns(theta)
-    own, beside = problem.seen(columns[:count]), problem.seen(columns[count:])
+    own, beside = problem.seen(columns[: gain.size]), problem.seen(columns[gain.size :])
     basis, _ = np.linalg.qr(beside.T)
-    by_theta = problem.seen(np.einsum("k,mkn->mn", gain, derivatives[:, :count]))
+    by_theta = problem.seen(np.einsum("k,mkn->mn", gain, derivatives[:, : gain.size]))
     rows = np.concatenate(((problem.seen(problem.y) - gain @ own)[None, :], own, by_theta))
     rows = rows - (rows @ basis) @ basis.T
     return rows[0], rows[1:]
