@@ -279,12 +279,14 @@ class Modes:
             count = 0 if equal else _term_count(group, centre, horizon)
             scale = abs(centre) or 1.0
             terms = None if equal else _terms(group, centre, scale, count)
+            nodes: tuple[complex, ...] = tuple(group)
             if real:
+                nodes = tuple(e.real for e in group)
                 rows, centre = np.ascontiguousarray(rows.real), centre.real
                 terms = None if terms is None else np.ascontiguousarray(terms.real)
             place = slice(first, first + size)
             share = 2.0 if upper else 1.0
-            self._clusters.append(_Cluster(tuple(group), centre, place, share, terms, scale, rows))
+            self._clusters.append(_Cluster(nodes, centre, place, share, terms, scale, rows))
             first = place.stop
         self.size = first
         self.input_direction = np.zeros(first)

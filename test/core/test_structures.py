@@ -20,7 +20,7 @@ from relay_autotune.identification.waveform.rational import (
     free_motion,
     responses,
 )
-from relay_autotune.identification.waveform.starts import is_unseen
+from relay_autotune.identification.waveform.starts import is_unobservable
 from relay_autotune.process.model_parameters import Denominator, Lag, Quadratic
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
@@ -233,7 +233,7 @@ def test_no_rival_rings_faster_than_the_samples_show(seed):
     ],
 )
 def test_a_fit_that_lives_between_the_samples_is_none(model, unseen):
-    assert is_unseen(model, interval=0.1, length=100.0) is unseen
+    assert is_unobservable(model, interval=0.1, length=100.0) is unseen
 
 
 @pytest.mark.nightly
@@ -253,18 +253,18 @@ def test_a_drift_beside_a_slow_pole_and_zero_is_no_process():
     assert found.ultimate_gain == pytest.approx(1.9034, rel=0.05)
 
 
-def test_a_response_that_turns_only_after_the_record_is_unseen():
+def test_a_response_that_turns_only_after_the_record_is_unobservable():
     # From 400 s on a higher command is said to lower the measurement, which first rises.
     model = TransferFunction(
         -0.01, dead_time=5.0, zeros=(-300.0,), time_constants=(100.0,), integrators=1
     )
-    assert is_unseen(model, 1.0, 390.0)
-    assert not is_unseen(model, 1.0, 420.0)
+    assert is_unobservable(model, 1.0, 390.0)
+    assert not is_unobservable(model, 1.0, 420.0)
     # A command that never stays so long on one side does not show it either.
-    assert is_unseen(model, 1.0, 4000.0, pushed=390.0)
-    assert not is_unseen(model, 1.0, 4000.0, pushed=420.0)
+    assert is_unobservable(model, 1.0, 4000.0, pushed=390.0)
+    assert not is_unobservable(model, 1.0, 4000.0, pushed=420.0)
     inverse = TransferFunction(2.0, dead_time=1.0, zeros=(-3.0,), time_constants=(10.0, 4.0))
-    assert not is_unseen(inverse, 0.1, 100.0)
+    assert not is_unobservable(inverse, 0.1, 100.0)
 
 
 def test_the_support_of_candidates_that_are_not_in_order():

@@ -17,11 +17,10 @@ from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.waveform.candidates import _followed
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.separable import problem_of
-from relay_autotune.identification.waveform.starts import latest_dead_time
+from relay_autotune.identification.waveform.starts import latest_dead_time, multistart
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import RelayRun, simulate_relay
 from relay_autotune.process.structures import TABLE
@@ -362,4 +361,4 @@ def test_a_structure_of_which_no_fit_can_begin_is_left_out():
     told = record.time, record.measurement, record.input()
     # One of those that are fitted whatever others promise.
     problem = problem_of([told], TABLE["fopdt"])
-    assert _followed(problem, [], math.inf) is None
+    assert multistart(problem, [], 1e-6) is None

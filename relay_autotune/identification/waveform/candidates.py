@@ -22,6 +22,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.residuals import Colour
 from relay_autotune.identification.waveform.separable import (
     NEGLIGIBLE,
+    TRIAL,
     Problem,
     Trial,
     evaluate,
@@ -31,37 +32,28 @@ from relay_autotune.identification.waveform.separable import (
     refine,
 )
 from relay_autotune.identification.waveform.starts import (
-    Starts,
-    begin,
+    Guess,
+    best_of,
     changes_within,
     coarse,
-    go_on,
-    is_unseen,
+    is_unobservable,
     latest_dead_times,
-    least_promised,
     longest_push,
-    refine_all,
-    refine_best,
+    multistart,
     start_fopdt,
+    start_unstable,
     time_scales,
-    two_lags,
 )
 from relay_autotune.process.structures import (
     FOPDT,
     INTEGRATOR_INVERSE,
-    INTEGRATOR_LAG,
     IPDT,
     LAG_COMPLEX,
-    LAG_N,
-    LAG_N_ZERO,
-    SOPDT,
     SOPDT_ZERO,
+    TABLE,
     THREE_LAGS,
-    TWO_EQUAL_ONE,
     UNSTABLE_FOPDT,
-    UNSTABLE_SOPDT,
     Structure,
-    equal_lags,
 )
 from relay_autotune.process.transfer_function import TransferFunction
 
@@ -74,14 +66,6 @@ _ENOUGH_REST = 15
 _STILL, _STILL_LATER = 0.05, 0.5
 # Least number of moves of a command that tell whether one came before the record.
 _MANY = 6
-# A step that gains less than this share of the sum of squares changes no choice.
-TRIAL = 1e-6
-# A structure whose mean square is this many times the least one has no support.
-_BEYOND_HOPE = 4.0
-# Ratio of the promised mean square to the least one, from which a fit is given up. Below the
-# second, in squares of the range, the residual is curvature, which the promise neglects.
-_NO_PROMISE = 6.0
-_CLEAN = 1e-6
 # What may be estimated beside the model, as fields of a problem.
 TERMS = ("drift", "relaxation", "past", "unequal", "load")
 # Steps of a fit with a further term; instants at which a load is tried, and steps to the best.
@@ -100,13 +84,8 @@ _LATE = 0.25
 _LATEST = 0.5
 # Latest turn of an inverse response, in lengths of the test: a later one is a drift.
 _HORIZON = 2.0
-# Slow lags of an inverse response at the start, relative to the fast one.
-_SLOWER = (2.0, 6.0, 20.0)
 # Largest share that a FOPDT leaves unexplained which shows the direction of the process.
 _NEARLY_ALL = 0.1
-
-# A structure, and the first trials of its fit.
-_Begun = tuple[Structure, list[Trial]]
 
 
 @dataclass(frozen=True)
@@ -177,13 +156,13 @@ class FitContext:
         :param sign: the direction in which the relay worked; 0: not known.
         :param held: True: a relay held the process.
         """
-        fopdt = refine_best(problem, start_fopdt(problem, sign), tolerance=TRIAL)
+        fopdt = best_of(problem, start_fopdt(problem, sign))
         return cls(problem, fopdt, sign, held)
 
     @cached_property
-    def starts(self) -> Starts:
-        """Starts of every structure."""
-        return Starts(self.problem, self.fopdt)
+    def guess(self) -> Guess:
+        """Where the fits of all structures begin."""
+        return Guess.of(self.problem, self.fopdt)
 
     @property
     def floor(self) -> float:
@@ -196,10 +175,10 @@ class FitContext:
         return float(np.ptp(self.problem.time))
 
     @cached_property
-    def unstable(self) -> list[Trial]:
-        """The beginning of an unstable FOPDT's fit, from which two structures go on."""
+    def unstable(self) -> Trial:
+        """The best fit of an unstable FOPDT, from which a further lag goes on."""
         problem = replace(self.problem, structure=UNSTABLE_FOPDT)
-        return begin(problem, self.starts.unstable(problem))
+        return best_of(problem, start_unstable(problem))
 
     @cached_property
     def latest(self) -> tuple[float, float]:
@@ -249,7 +228,7 @@ class FitContext:
             # Commands may lose their effect on one side, but not act the other way there.
             return None
         shortest, _ = time_scales(self.problem)
-        if is_unseen(model, shortest, self.length, self.pushed):
+        if is_unobservable(model, shortest, self.length, self.pushed):
             return None
         return Candidate(problem, state, model, self._score(problem, state, model))
 
@@ -289,8 +268,7 @@ class FitContext:
                 state = refine(problem, candidate.state.theta, tolerance=TRIAL, most=_STEPS)
                 anew = self._anew(problem, terms)
                 if anew:
-                    again = refine_best(problem, anew, tolerance=TRIAL)
-                    state = min(state, again, key=lambda s: s.cost)
+                    state = min(state, best_of(problem, anew), key=lambda s: s.cost)
             other = self.candidate(problem, state)
             if other is not None:
                 found.append(other)
@@ -333,7 +311,7 @@ class FitContext:
         fopdt = self.fopdt
         if any(nuisances_of(problem)):
             starts = [self.fopdt.theta, *start_fopdt(problem, self.sign)]
-            fopdt = refine_best(problem, starts, tolerance=TRIAL)
+            fopdt = best_of(problem, starts)
             # A FOPDT has the longest dead time of all, since it includes every small lag.
             problem = drop_first_dead_time(problem, fopdt)
         return replace(self, problem=problem, fopdt=fopdt)
@@ -360,10 +338,10 @@ class FitContext:
             if name in same:
                 found.append(same[name])
                 continue
-            for structure, begun in self._family(name, order):
-                problem = replace(self.problem, structure=structure)
-                state = _followed(problem, begun, least)
+            for structure in self._family(name, order):
+                state = self._best_fit(structure, least)
                 if state is not None:
+                    problem = replace(self.problem, structure=structure)
                     least = min(least, max(state.cost, self.floor) / problem.time.size)
                     found.append(self.candidate(problem, state))
         return [c for c in found if c is not None]
@@ -374,16 +352,11 @@ class FitContext:
         With others no oscillation lasts. In the direction of the relay, a FOPDT shows the fast
         part of an inverse response.
         """
-        fast, dead_time = self.starts.tau, self.starts.dead_time
-        tried = (
-            (SOPDT_ZERO, [two_lags(n * fast, fast, dead_time) for n in _SLOWER]),
-            (INTEGRATOR_INVERSE, [np.array((math.log(fast), dead_time))]),
-        )
         found = []
-        for structure, thetas in tried:
+        for structure in (SOPDT_ZERO, INTEGRATOR_INVERSE):
             problem = replace(self.problem, structure=structure)
-            state = refine_best(problem, thetas, tolerance=TRIAL)
-            found.append(self.candidate(problem, state))
+            state = multistart(problem, self.guess.turned(structure), TRIAL)
+            found.append(None if state is None else self.candidate(problem, state))
         return [c for c in found if c is not None and c.model.process_sign * self.sign < 0]
 
     def may_be_chosen(self, candidate: Candidate) -> bool:
@@ -405,50 +378,31 @@ class FitContext:
         state = refine(problem, candidate.state.theta, tolerance=TRIAL, most=most)
         return self.candidate(problem, state)
 
-    def _begun(self, structure: Structure, thetas: list[FloatArray]) -> Iterator[_Begun]:
-        """Begin fits; with too few samples, of first order only."""
-        enough = _SAMPLES_EACH * (structure.order + 4) <= self.problem.time.size
-        if enough or structure.order <= 1:
-            yield structure, begin(replace(self.problem, structure=structure), thetas)
+    def _family(self, name: str, order: int) -> Iterator[Structure]:
+        """Yield the structures of a name that there are samples enough for."""
+        row = TABLE[name]
+        if row.any_order:
+            most = _MOST_LAGS_WITH_ZERO if row.zero else MOST_LAGS
+            family = [row.of_order(n) for n in ([order] if order else range(2, most + 1))]
+        else:
+            # A pair with a lag is three lags of which two are complex.
+            family = [THREE_LAGS if row == LAG_COMPLEX else row]
+        for structure in family:
+            enough = _SAMPLES_EACH * (structure.order + 4) <= self.problem.time.size
+            if enough or structure.order <= 1:
+                yield structure
 
-    def _family(self, name: str, order: int) -> Iterator[_Begun]:
-        starts, begun = self.starts, self._begun
-        match name:
-            case FOPDT.name:
-                yield from begun(FOPDT, [self.fopdt.theta])
-            case LAG_N.name:
-                for n in [order] if order else range(2, MOST_LAGS + 1):
-                    yield from begun(equal_lags(n), [starts.lag_n(n)])
-            case LAG_N_ZERO.name:
-                for n in [order] if order else range(2, _MOST_LAGS_WITH_ZERO + 1):
-                    yield from begun(LAG_N_ZERO.of_order(n), starts.lag_n_zero(n))
-            case SOPDT.name:
-                yield from begun(SOPDT, starts.sopdt())
-            case SOPDT_ZERO.name:
-                yield from begun(SOPDT_ZERO, [*starts.sopdt(), self._two_equal_lags()])
-            case TWO_EQUAL_ONE.name:
-                yield from begun(TWO_EQUAL_ONE, starts.two_equal_one())
-            case THREE_LAGS.name | LAG_COMPLEX.name:
-                yield from begun(THREE_LAGS, starts.third())
-            case IPDT.name:
-                yield from begun(IPDT, [starts.integrator()])
-            case INTEGRATOR_LAG.name:
-                yield from begun(INTEGRATOR_LAG, starts.integrator_lag())
-            case INTEGRATOR_INVERSE.name:
-                yield from begun(INTEGRATOR_INVERSE, starts.integrator_lag())
-            case UNSTABLE_FOPDT.name:
-                yield UNSTABLE_FOPDT, self.unstable
-            case UNSTABLE_SOPDT.name:
-                yield from begun(UNSTABLE_SOPDT, starts.unstable_second(self.unstable[0].theta))
-
-    def _two_equal_lags(self) -> FloatArray:
-        """Return a start of two lags and a zero: the two equal ones that fit best.
-
-        The starts from a FOPDT do not lead to every inverse response.
-        """
-        problem = replace(self.problem, structure=LAG_N_ZERO.of_order(2))
-        best = go_on(problem, begin(problem, self.starts.lag_n_zero(2)))[0]
-        return np.array((best.theta[0], 0.0, best.theta[1]))
+    def _best_fit(self, structure: Structure, least: float) -> Trial | None:
+        """Return the best fit of a structure; None where it is hopeless beside the least one."""
+        if structure == FOPDT:
+            return self.fopdt
+        problem = replace(self.problem, structure=structure)
+        if structure == UNSTABLE_FOPDT:
+            return self.unstable
+        growing = math.exp(float(self.unstable.theta[0])) if structure.unstable else math.nan
+        if structure.name in _ALWAYS:
+            least = math.inf
+        return multistart(problem, self.guess.starts(structure, growing), TRIAL, least)
 
 
 def nuisances_of(problem: Problem, terms: Iterable[str] = TERMS) -> tuple[bool, ...]:
@@ -502,38 +456,6 @@ def with_load(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
         load += min(max(shift, -farthest), farthest)
         load = min(max(load, float(time[0])), float(time[-1]))
     return loaded, found
-
-
-def _followed(problem: Problem, begun: list[Trial], least: float) -> Trial | None:
-    """Return the best fit that a beginning leads to; None where it is hopeless.
-
-    :param problem: the problem.
-    :param begun: the beginning.
-    :param least: the least mean square of another structure.
-    """
-    asked = problem.structure.name in _ALWAYS
-
-    def promises_nothing(states: list[Trial]) -> bool:
-        return least_promised(problem, states) > _NO_PROMISE * max(least, _CLEAN)
-
-    def is_hopeless(state: Trial) -> bool:
-        return state.cost / state.residual.size > _BEYOND_HOPE * least
-
-    if not asked and promises_nothing(begun):
-        return None
-    rough = go_on(problem, begun)
-    if not rough:
-        # No response of any of them can be told, as of a command that is far too small.
-        return None
-    if not asked and is_hopeless(rough[0]):
-        if promises_nothing(rough[:1]):
-            return None
-        # It may not have converged yet.
-        best = rough[0]
-        rough = [refine(coarse(problem), best.theta, tolerance=TRIAL, damping=best.damping)]
-        if is_hopeless(rough[0]):
-            return None
-    return refine_all(problem, rough, TRIAL)
 
 
 def needs_no_past(problem: Problem, sign: int) -> bool:

@@ -20,7 +20,6 @@ import numpy as np
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.candidates import (
-    TRIAL,
     Candidate,
     FitContext,
     as_in,
@@ -32,6 +31,7 @@ from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import Colour, colour_of, slow_colour
 from relay_autotune.identification.waveform.separable import (
     NEGLIGIBLE,
+    TRIAL,
     Problem,
     Trial,
     information_criterion,

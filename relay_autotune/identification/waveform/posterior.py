@@ -22,12 +22,12 @@ from scipy.special import gammaincinv
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.result import Part
-from relay_autotune.identification.waveform.candidates import TRIAL
 from relay_autotune.identification.waveform.choice import PLAIN
 from relay_autotune.identification.waveform.fit_covariance import Fit
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.separable import (
     NEGLIGIBLE,
+    TRIAL,
     Problem,
     Trial,
     left_beside,
@@ -407,7 +407,7 @@ def _normal(count: int, size: int, rng: np.random.Generator) -> FloatArray:
     :param size: of each.
     :param rng: the source.
     """
-    half = rng.standard_normal((max(count // 2, size), size))
+    half = rng.standard_normal((max(-(-count // 2), size), size))
     values, axes = np.linalg.eigh(half.T @ half / half.shape[0])
     half = half @ (axes / np.sqrt(values)) @ axes.T
     return np.stack((half, -half), axis=1).reshape(-1, size)

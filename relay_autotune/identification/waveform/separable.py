@@ -30,6 +30,8 @@ from relay_autotune.record.record import Input, PiecewiseConstant
 
 # Residual that is rounding, as a share of the measurement's range.
 NEGLIGIBLE = 1e-10
+# A step that gains less than this share of the sum of squares changes no choice.
+TRIAL = 1e-6
 _MOST_ITERATIONS = 80
 _MOST_ROUGH_ITERATIONS = 25
 _LEAST_GAIN = 1e-15
@@ -426,14 +428,14 @@ def refine(
     return replace(state, damping=damping)
 
 
-def promised(problem: Problem, state: Trial) -> float:
-    """Return how much less the sum of squares would be if the model were linear in theta.
+def predicted_cost(problem: Problem, state: Trial) -> float:
+    """Return what the sum of squares would become if the model were linear in theta.
 
     :param problem: the problem.
     :param state: any of its states.
     """
     _, normal, gradient = _linearised(problem, state)
-    return float(gradient @ _solve(normal, gradient, 0.0))
+    return state.cost - float(gradient @ _solve(normal, gradient, 0.0))
 
 
 def _linearised(problem: Problem, state: Trial) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -8,20 +8,26 @@ For a FOPDT a grid of dead times and lags is searched; from its fit every other 
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.rational import columns_of, unit_steps
 from relay_autotune.identification.waveform.separable import (
+    TRIAL,
     Problem,
     Trial,
     evaluate,
-    promised,
+    predicted_cost,
     refine,
 )
+from relay_autotune.process.model_parameters import Quadratic
 from relay_autotune.process.response import response
+from relay_autotune.process.structures import Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Input, PiecewiseConstant
@@ -41,7 +47,7 @@ _RESTING, _RESTS = 15, (1.0, 0.5, 0.25)
 _BELIEVED = 2.0
 
 
-def is_unseen(
+def is_unobservable(
     model: TransferFunction, interval: float, length: float, pushed: float = math.inf
 ) -> bool:
     """Return whether a fit owes its small residual to what happens between the samples.
@@ -130,12 +136,15 @@ def latest_dead_time(time: FloatArray, y: FloatArray, u: Input, sign: int) -> fl
 _GRID_SAMPLES = 240
 _BEST = 3
 _COARSE = 1e-4
-# Several starts: steps of each, steps and number of those that go on, and the ratio to the least
-# sum of squares beyond which one is dropped.
-_FIRST_STEPS = 5
-_SECOND_STEPS = 8
-_MORE = 3
-_HOPELESS = 4.0
+# Rounds of steps on few samples: largest number of steps, and how many starts take them.
+_ROUNDS = ((5, 99), (8, 3))
+# Ratio of the predicted mean square to the least one, from which a fit is given up. Below the
+# second, in squares of the range, the residual is curvature, which the prediction neglects.
+_HOPELESS, _CLEAN = 6.0, 1e-6
+# Slow lags of an inverse response at the start, relative to the fast one.
+_SLOWER = (2.0, 6.0, 20.0)
+# Dampings at the start; shares of the dead time that fast lags have, and what a zero leaves of it.
+_DAMPINGS, _SHARES_OF_FAST, _HIDDEN = (1.35, 0.9, 0.4), (0.3, 0.7, 3.0), 0.3
 # Largest share of the samples at which a relay switches. Where a command changes more often, only
 # changes by at least this share of its range count.
 _MOST_SWITCHES = 0.5
@@ -144,7 +153,6 @@ _SWITCH = 0.25
 # of squares up to which all samples decide between them.
 _SAME = 0.02
 _UNDECIDED = 1.05
-_EXACT = 1e-15
 
 # Dead times tried at the start, as shares of the longest one.
 # Noise may make a relay switch faster than the process answers, hence those beyond 1.
@@ -152,18 +160,6 @@ _SHARES = (
     *(0.0, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.67, 0.8, 0.95),
     *(1.2, 1.5, 1.9, 2.4),
 )
-
-
-def two_lags(large: float, small: float, dead_time: float) -> FloatArray:
-    """Return theta of a second order with two lags, at least a little apart.
-
-    :param large: time constant [s].
-    :param small: the other one [s].
-    :param dead_time: [s].
-    """
-    pair = math.sqrt(large * small)
-    ratio = max((large + small) / (2.0 * pair), 1.05)
-    return np.array((math.log(pair), math.log(ratio), dead_time))
 
 
 def changes_within(u: Input, time: FloatArray) -> FloatArray:
@@ -224,77 +220,56 @@ def coarse(problem: Problem) -> Problem:
     return problem.thinned(_GRID_SAMPLES)
 
 
-def begin(problem: Problem, thetas: list[FloatArray]) -> list[Trial]:
-    """Refine each start by a few steps on few samples, and return the best first.
+def multistart(
+    problem: Problem, thetas: Sequence[FloatArray], tolerance: float, least: float = math.inf
+) -> Trial | None:
+    """Return the best fit that any of some starts leads to; None where it is hopeless.
 
-    These steps show which starts are worth more. A single start is followed to its end.
+    All take a few steps on few samples, the best ones some more, and all samples decide between
+    the last two.
+
+    :param problem: the problem.
+    :param thetas: starts.
+    :param tolerance: relative gain below which a step is the last one.
+    :param least: mean square of the best structure so far, in squares of the range: a fit that
+        will not come near it is given up.
+    """
+    few, reached = coarse(problem), [evaluate(coarse(problem), theta) for theta in thetas]
+    for steps, count in _ROUNDS:
+        reached = [
+            refine(few, s.theta, tolerance=_COARSE, most=steps, damping=s.damping)
+            for s in reached[:count]
+        ]
+        reached = _apart_from_each_other(problem, reached)
+        if not reached:
+            return None
+        predicted = min(predicted_cost(few, s) for s in reached)
+        if predicted > _HOPELESS * max(least, _CLEAN) * few.time.size:
+            return None
+    last = [s for s in reached if s.cost <= _UNDECIDED * reached[0].cost][:2]
+    fits = [refine(problem, s.theta, tolerance=tolerance, damping=s.damping) for s in last]
+    return min(fits, key=lambda s: s.cost)
+
+
+def best_of(problem: Problem, thetas: Sequence[FloatArray]) -> Trial:
+    """Return the best fit that any of some starts leads to, whatever it leaves.
 
     :param problem: the problem.
     :param thetas: starts, at least one.
     """
-    few, most = coarse(problem), {} if len(thetas) == 1 else {"most": _FIRST_STEPS}
-    begun = [refine(few, theta, tolerance=_COARSE, **most) for theta in thetas]
-    return sorted(begun, key=lambda s: s.cost)
+    found = multistart(problem, thetas, TRIAL)
+    assert found is not None
+    return found
 
 
-def go_on(problem: Problem, begun: list[Trial]) -> list[Trial]:
-    """Refine the best trials further on few samples, and return the best first.
-
-    :param problem: the problem.
-    :param begun: from :func:`begin`.
-    :return: two fits where few samples do not tell which is better, else one.
-    """
-    if len(begun) == 1:
-        return begun
-    few = coarse(problem)
-    reached = [
-        refine(few, s.theta, tolerance=_COARSE, most=_SECOND_STEPS, damping=s.damping)
-        for s in _apart_from_each_other(problem, begun, _HOPELESS)[:_MORE]
-    ]
-    return _apart_from_each_other(problem, reached, _UNDECIDED)[:2]
-
-
-def least_promised(problem: Problem, begun: list[Trial]) -> float:
-    """Return the least mean square that any beginning would lead to if models were linear.
-
-    :param problem: the problem.
-    :param begun: from :func:`begin`.
-    """
-    few = coarse(problem)
-    return min(s.cost - promised(few, s) for s in begun) / few.time.size
-
-
-def _apart_from_each_other(problem: Problem, states: list[Trial], limit: float) -> list[Trial]:
-    """Return distinct states of at most ``limit`` times the least cost, the best first."""
-    states = sorted(states, key=lambda s: s.cost)
+def _apart_from_each_other(problem: Problem, states: list[Trial]) -> list[Trial]:
+    """Return distinct states, the best first."""
     chosen: list[Trial] = []
-    for state in states:
+    for state in sorted(states, key=lambda s: s.cost):
         size = unit_steps(problem.structure, state.theta)
-        near = (np.abs((state.theta - c.theta) / size).max() < _SAME for c in chosen)
-        if state.cost <= limit * states[0].cost and not any(near):
+        if all(np.abs((state.theta - c.theta) / size).max() >= _SAME for c in chosen):
             chosen.append(state)
     return chosen
-
-
-def refine_best(problem: Problem, thetas: list[FloatArray], *, tolerance: float = 0.0) -> Trial:
-    """Return the best fit that any of the starts leads to: first on few samples, then on all.
-
-    :param problem: the problem.
-    :param thetas: starts, at least one.
-    :param tolerance: relative gain below which a step is the last one; 0: rounding.
-    """
-    return refine_all(problem, go_on(problem, begin(problem, thetas)), tolerance or _EXACT)
-
-
-def refine_all(problem: Problem, rough: list[Trial], tolerance: float) -> Trial:
-    """Return the best fit to all samples from fits to few of them.
-
-    :param problem: the problem.
-    :param rough: fits to few samples, at least one.
-    :param tolerance: relative gain below which a step is the last one.
-    """
-    fits = [refine(problem, s.theta, tolerance=tolerance, damping=s.damping) for s in rough]
-    return min(fits, key=lambda s: s.cost)
 
 
 def start_fopdt(problem: Problem, sign: int = 0) -> list[FloatArray]:
@@ -367,98 +342,105 @@ def _table(
     return np.asarray(table - table.mean(axis=1, keepdims=True))
 
 
-class Starts:
-    """Starts of every structure from the FOPDT that fits best.
+@dataclass(frozen=True)
+class Guess:
+    """Where fits begin: at the FOPDT that fits best.
 
-    :param problem: the problem with its FOPDT structure.
-    :param fopdt: its best fit.
+    :param tau: its lag [s].
+    :param dead_time: its dead time [s].
+    :param frequency: at which starts have its response, about that of a relay's oscillation
+        [rad/s].
+    :param shortest: least time of a start [s].
     """
 
-    def __init__(self, problem: Problem, fopdt: Trial) -> None:
-        shortest, self.longest = time_scales(problem)
-        # A FOPDT that fits badly may run off to an integrator, which is no start for the others.
-        self.tau = min(math.exp(float(fopdt.theta[0])), 3.0 * self.longest)
-        self.dead_time = float(fopdt.theta[1])
-        self._least = 0.1 * shortest
-        point = ultimate_point(
-            TransferFunction.fopdt(1.0, self.tau, max(self.dead_time, self._least))
-        )
-        # Frequency at which starts equal the FOPDT: about that of a relay's oscillation.
-        self._w = point.frequency if point is not None else 1.0 / self.longest
+    tau: float
+    dead_time: float
+    frequency: float
+    shortest: float
 
-    def lag_n(self, order: int) -> FloatArray:
-        """Return (log tau, D) of n equal lags, with the FOPDT's response at one frequency."""
-        w = self._w
-        square = (1.0 + (w * self.tau) ** 2) ** (1.0 / order) - 1.0
-        tau = max(math.sqrt(square) / w, self._least)
-        phase = w * self.dead_time + math.atan(w * self.tau) - order * math.atan(w * tau)
-        return np.array((math.log(tau), max(phase / w, self._least)))
+    @classmethod
+    def of(cls, problem: Problem, fopdt: Trial) -> Guess:
+        """Return what a FOPDT's fit says.
 
-    def lag_n_zero(self, order: int) -> list[FloatArray]:
-        """Return starts of equal lags with a zero, which can look like dead time or hide it."""
-        theta = self.lag_n(order)
-        return [
-            np.array((theta[0] + math.log(scale), share * theta[1]))
-            for scale, share in ((1.0, 1.0), (1.0, 0.3), (0.6, 0.6), (0.6, 0.15))
-        ]
-
-    def sopdt(self) -> list[FloatArray]:
-        """Return starts of a second order: overdamped, critical, underdamped."""
-        tau, dead_time = self.lag_n(2)
-        small = max(0.3 * self.dead_time, self._least)
-        return [
-            two_lags(self.tau, small, max(self.dead_time - small, self._least)),
-            np.array((tau, math.log(0.9), dead_time)),
-            np.array((tau, math.log(0.4), dead_time)),
-        ]
-
-    def third(self) -> list[FloatArray]:
-        """Return starts of a second order with one more lag, near each other or slow."""
-        tau, dead_time = self.lag_n(3)
-        slow = math.log(self.tau)
-        fast = math.log(max(0.3 * self.dead_time, self._least))
-        rest = max(0.5 * self.dead_time, self._least)
-        return [
-            *(np.array((tau, damping, tau, dead_time)) for damping in (0.3, -0.05, -1.0)),
-            np.array((fast, -0.4, slow, rest)),
-        ]
-
-    def two_equal_one(self) -> list[FloatArray]:
-        """Return starts of two equal lags and another: near each other, and either one small."""
-        tau, dead_time = self.lag_n(3)
-        slow = math.log(self.tau)
-        fast = math.log(max(0.3 * self.dead_time, self._least))
-        rest = max(0.5 * self.dead_time, self._least)
-        return [
-            np.array((tau, tau, dead_time)),
-            np.array((slow, fast, rest)),
-            np.array((fast, slow, rest)),
-        ]
-
-    def integrator(self) -> FloatArray:
-        """Return (D,) of an integrator with dead time."""
-        return np.array((max(self.dead_time, self._least),))
-
-    def integrator_lag(self) -> list[FloatArray]:
-        """Return starts of an integrator with a lag that shares the dead time, or is longer."""
-        d = max(self.dead_time, self._least)
-        return [np.array((math.log(s * d), max(1.0 - s, 0.2) * d)) for s in (0.2, 0.7, 3.0)]
-
-    def unstable(self, problem: Problem) -> list[FloatArray]:
-        """Return the best few of a grid of (log tau, D) for an unstable FOPDT.
-
-        :param problem: with an unstable FOPDT structure.
+        :param problem: the problem with its FOPDT structure.
+        :param fopdt: its best fit.
         """
-        few = coarse(problem)
-        grid = [
-            np.array((math.log(tau * self.longest), share * self.longest))
-            for tau in (0.4, 1.0, 2.5, 6.0, 20.0)
-            for share in (0.05, 0.2, 0.4, 0.7)
-        ]
-        states = [evaluate(few, theta) for theta in grid]
-        return [s.theta for s in sorted(states, key=lambda s: s.cost)[:2]]
+        shortest, longest = time_scales(problem)
+        # A FOPDT that fits badly may run off to an integrator, which is no start for the others.
+        tau, least = min(math.exp(float(fopdt.theta[0])), 3.0 * longest), 0.1 * shortest
+        dead_time = max(float(fopdt.theta[1]), least)
+        point = ultimate_point(TransferFunction.fopdt(1.0, tau, dead_time))
+        return cls(tau, dead_time, 1.0 / longest if point is None else point.frequency, least)
 
-    def unstable_second(self, first: FloatArray) -> list[FloatArray]:
-        """Return starts of an unstable pole with a lag, from an unstable FOPDT's theta."""
-        d = max(float(first[1]), self._least)
-        return [np.array((first[0], math.log(s * d), max(1.0 - s, 0.2) * d)) for s in (0.2, 0.7)]
+    def equal_lags(self, order: int) -> tuple[float, float]:
+        """Return tau and D of n equal lags with the FOPDT's response at one frequency [s]."""
+        w = self.frequency
+        square = (1.0 + (w * self.tau) ** 2) ** (1.0 / order) - 1.0
+        tau = max(math.sqrt(square) / w, self.shortest)
+        phase = w * self.dead_time + math.atan(w * self.tau) - order * math.atan(w * tau)
+        return tau, max(phase / w, self.shortest)
+
+    def starts(self, structure: Structure, growing: float = math.nan) -> list[FloatArray]:
+        """Return starts of a structure: all its lags alike, or one slow and the others fast.
+
+        The slow one is the FOPDT's, an integrator or what grows; the fast ones take their share
+        of its dead time, or are longer. A zero can look like a dead time, or hide it.
+
+        :param structure: any.
+        :param growing: time constant of what grows [s].
+        """
+        factors = structure.factors
+        if not factors:
+            return [np.array([self.dead_time])]
+        found = []
+        stable = not (structure.integrators or structure.unstable)
+        one_kind = len(factors) == 1 and not isinstance(factors[0], Quadratic)
+        if stable:
+            tau, dead_time = self.equal_lags(structure.order)
+            for zeta in _DAMPINGS[:1] if one_kind else _DAMPINGS:
+                pairs = ([tau, zeta] if isinstance(f, Quadratic) else [tau] for f in factors)
+                found.append(np.array([*map(math.log, itertools.chain(*pairs)), dead_time]))
+        if not (stable and one_kind):
+            for slow in range(len(factors)) if stable else [-1]:
+                for share in _SHARES_OF_FAST[:1] if stable else _SHARES_OF_FAST:
+                    fast = max(share * self.dead_time, self.shortest)
+                    logs: list[float] = []
+                    for i, factor in enumerate(factors):
+                        large = growing if factor.unstable else self.tau if i == slow else fast
+                        pair = isinstance(factor, Quadratic)
+                        logs += _two_lags(large, fast) if pair else [math.log(large)]
+                    found.append(np.array([*logs, max(1.0 - share, 0.2) * self.dead_time]))
+        if structure.zero is not None:
+            found += [np.append(theta[:-1], _HIDDEN * theta[-1]) for theta in found]
+        return found
+
+    def turned(self, structure: Structure) -> list[FloatArray]:
+        """Return starts of an inverse response, of which the FOPDT shows the fast part.
+
+        :param structure: with a zero, and two lags, or an integrator and one.
+        """
+        if structure.integrators:
+            return [np.array((math.log(self.tau), self.dead_time))]
+        slow = (ratio * self.tau for ratio in _SLOWER)
+        return [np.array((*_two_lags(large, self.tau), self.dead_time)) for large in slow]
+
+
+def _two_lags(large: float, small: float) -> list[float]:
+    """Return log(1/w0) and log zeta of two lags, at least a little apart."""
+    pair = math.sqrt(large * small)
+    return [math.log(pair), math.log(max((large + small) / (2.0 * pair), 1.05))]
+
+
+def start_unstable(problem: Problem) -> list[FloatArray]:
+    """Return the best few of a grid of (log tau, D) for an unstable FOPDT.
+
+    :param problem: with an unstable FOPDT structure.
+    """
+    few, (_, longest) = coarse(problem), time_scales(problem)
+    grid = [
+        np.array((math.log(tau * longest), share * longest))
+        for tau in (0.4, 1.0, 2.5, 6.0, 20.0)
+        for share in (0.05, 0.2, 0.4, 0.7)
+    ]
+    states = [evaluate(few, theta) for theta in grid]
+    return [s.theta for s in sorted(states, key=lambda s: s.cost)[:2]]
