@@ -98,7 +98,7 @@ def test_a_determined_model_needs_no_combinations():
 
 
 @pytest.mark.long
-def test_rivals_have_support_and_widen_the_ultimate_point():
+def test_rivals_have_support():
     model = TransferFunction.lag_n(1.0, 6.0, 8, 0.6)
     relay = RelaySettings(0.0, 0.0, 1.0)
     end = simulate_relay(model, relay, cycles=4).command.times[-1]
@@ -109,11 +109,6 @@ def test_rivals_have_support_and_widen_the_ultimate_point():
     assert found.rivals
     assert 0.0 < found.support < 1.0
     assert found.support + sum(r.support for r in found.rivals) <= 1.0 + 1e-9
-    known = Known(structure=found.structure, order=found.model.order)
-    alone = identify(record, "waveform", known)
-    assert alone.support == 1.0
-    # The rivals differ in K_u, if little.
-    assert found.ultimate_gain_std > alone.ultimate_gain_std
 
 
 @pytest.mark.parametrize("loss", ["huber", "tukey"])
