@@ -362,3 +362,18 @@ def test_a_structure_of_which_no_fit_can_begin_is_left_out():
     # One of those that are fitted whatever others promise.
     problem = problem_of([told], TABLE["fopdt"])
     assert multistart(problem, [], 1e-6) is None
+
+
+@pytest.mark.long
+def test_a_jump_in_the_last_samples_is_left_out():
+    time = np.arange(0.0, 300.0, 0.5)
+    command = np.array([0.0, 1.0, -1.0, 1.0, 0.0, 1.0])[(time // 50.0).astype(int)]
+    process = TransferFunction.fopdt(1.0, 12.0, 3.0)
+    u = PiecewiseConstant.from_samples(time, command)
+    noise = 0.02 * np.random.default_rng(2).standard_normal(time.size)
+    y = response(process, time, u) + noise
+    y[time > 292.0] += 4.0
+    found = identify_waveform(Record(time, y, command))
+    assert found.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.03)
+    assert found.fit.residual_rms < 0.03
+    assert any("the last" in w and "were left out" in w for w in found.warnings)

@@ -61,8 +61,6 @@ class Noise:
 
 def raw_residual(problem: Problem, state: Trial) -> FloatArray:
     """Return the residual of a fit, neither weighted nor whitened, shape (n,)."""
-    if problem.weight is None and problem.colour is None:
-        return state.residual
     columns, _ = problem.columns(state.theta)
     return np.asarray(problem.y - state.coefficients @ columns)
 

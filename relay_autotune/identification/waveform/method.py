@@ -48,6 +48,9 @@ _LEAST_SAMPLES = 12
 _MOST_SAMPLES = 2_000_000
 _OUTLIER = 6.0
 _MOST_OUTLIERS = 0.02
+# Largest share of the samples after a jump near the end that are left out, and the ratio by which
+# that divides the mean square of the residual.
+_MOST_LATE, _DIVIDED = 0.05, 0.5
 # Ratio of two records' noise up to which they count as equal.
 _ALIKE = 1.2
 _MOST_ROUNDS = 20
@@ -183,6 +186,15 @@ def _spared_of_outliers(
         weight[_places(problem, first.problem)] = first.problem.weight
         again = chosen(replace(problem, weight=weight))
         return _reweighted(problem, again, known.loss, base)
+    kept = _before_jump(problem, fit)
+    if kept < problem.time.size:
+        last = problem.time[kept]
+        jumped = (
+            f"from {last:.4g} s on, the last {problem.time.size - kept} samples lie far off what "
+            "explains all before them, and were left out: look at what happened there"
+        )
+        problem = problem.part(slice(None, kept))
+        fit = replace(chosen(problem), warnings=(jumped,))
     outlying = _outliers(problem, fit.problem, fit.state)
     if not np.any(outlying):
         return fit
@@ -193,7 +205,7 @@ def _spared_of_outliers(
         f"{int(np.sum(outlying))} of the samples lie more than {_OUTLIER:g} standard deviations "
         "off every model and were left out: check the sensor for spikes"
     )
-    return replace(again, warnings=(told,))
+    return replace(again, warnings=(*fit.warnings, told))
 
 
 def _reweighted(whole: Problem, fit: Fit, loss: str, base: FloatArray) -> Fit:
@@ -214,6 +226,25 @@ def _reweighted(whole: Problem, fit: Fit, loss: str, base: FloatArray) -> Fit:
 def _places(whole: Problem, part: Problem) -> NDArray[np.int64]:
     """Return where the samples of a part are among those of the whole."""
     return np.searchsorted(whole.index, part.index)
+
+
+def _before_jump(whole: Problem, fit: Fit) -> int:
+    """Return how many samples come before a jump near the end that no model explains.
+
+    A step of a sensor, or a hand on the process, in the last samples would spoil all before it.
+
+    :param whole: all samples.
+    :param fit: the fit of some of them.
+    """
+    problem = replace(fit.problem, colour=None, weight=None)
+    square = np.cumsum(raw_residual(problem, fit.state) ** 2)
+    n = square.size
+    mean = square / np.arange(1, n + 1)
+    first = int((1.0 - _MOST_LATE) * n)
+    kept = first + int(np.argmin(mean[first:])) + 1
+    if len(problem.bounds) > 1 or kept == n or mean[kept - 1] > _DIVIDED * mean[-1]:
+        return whole.time.size
+    return int(np.searchsorted(whole.index, problem.index[kept]))
 
 
 def _outliers(whole: Problem, problem: Problem, state: Trial) -> NDArray[np.bool_]:
