@@ -88,11 +88,21 @@ def table(entries: Iterable[Quantity]) -> str:
             f"`{entry.name}`",
             default_text(entry.default),
             entry.unit,
-            entry.range_text,
+            _short(entry),
             entry.description,
         )
         lines.append(f"| {' | '.join(cells)} |".replace("|  |", "| |"))
     return "\n".join(lines)
+
+
+def _short(entry: Quantity) -> str:
+    """Return the range of a parameter without its unit, which has a column of its own."""
+    text = entry.range_text.replace(f" [{entry.unit}]", "").replace(" where it is not given", "")
+    return (
+        text.replace("any number", "any")
+        .replace(f" {entry.unit},", ",")
+        .removesuffix(f" {entry.unit}")
+    )
 
 
 def checks_table(checks: Iterable[Check]) -> str:
@@ -194,9 +204,9 @@ def default_text(default: object) -> str:
     if default in ((), ""):
         return "not given"
     if isinstance(default, float) and math.isnan(default):
-        return "NaN (not given)"
+        return "NaN"
     if isinstance(default, float) and math.isinf(default):
-        return f"`{'-' if default < 0 else ''}.inf` (no limit)"
+        return f"`{'-' if default < 0 else ''}.inf`"
     return f"`{default}`"
 
 
