@@ -23,7 +23,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, Self, TypeVar, get_type_hints
 
 from relay_autotune.errors import RelayAutotuneError
 
@@ -66,7 +66,7 @@ class Quantity:
     flag: str = ""
     description: str = ""
 
-    def means(self, description: str) -> Quantity:
+    def means(self, description: str) -> Self:
         """Return the quantity with its description.
 
         :param description: one sentence for people.

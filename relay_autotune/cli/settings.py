@@ -27,159 +27,115 @@ NOT_GIVEN = math.nan
 
 
 @dataclass(frozen=True)
-class Setting:
-    """One of the settings of a loop.
+class Setting(Quantity):
+    """One of the settings of a loop; a default of () stands for a range.
 
-    :param quantity: its name, unit and help; a default of () stands for a range.
-    :param metavar: what its flag takes; empty: it follows from the quantity.
+    :param metavar: what its flag takes; empty: it follows from the unit.
     :param question: how it is asked for; empty: nobody asks for it.
     :param example: what may be typed.
     :param parameters: of relay_node that it sets, for a range the lower and the upper one.
     """
 
-    quantity: Quantity
     metavar: str = ""
     question: str = ""
     example: str = ""
     parameters: tuple[str, ...] = ()
 
     @property
-    def name(self) -> str:
-        """Its name among the options of the command."""
-        return self.quantity.name
-
-    @property
-    def flag(self) -> str:
-        """Its flag, such as --command-within."""
-        return flag_of(self.quantity)
-
-    @property
-    def is_range(self) -> bool:
-        """Whether it has a lower and an upper end."""
-        return self.quantity.default == ()
+    def ends(self) -> int:
+        """How many numbers it takes: two for a range."""
+        return 2 if self.default == () else 1
 
     @property
     def read(self) -> Callable[[str], Any]:
         """Return the value of a text; None: it has none."""
-        return pair_of if self.is_range else number_of
+        return pair_of if self.ends > 1 else number_of
 
     def add_to(self, group: argparse._ActionsContainer) -> None:
         """Add its flag to some others."""
-        default, how = self.quantity.default, dict[str, Any]()
-        if self.is_range:
+        default, how = self.default, dict[str, Any]()
+        if self.ends > 1:
             how = {"nargs": 2, "type": finite, "metavar": ("LOW", "HIGH")}
         elif isinstance(default, bool):
             # A proof may be wanted, not wanted, or asked for.
             asks = self.name == "verify"
             how["action"] = argparse.BooleanOptionalAction if asks else "store_true"
             how["default"] = None if asks else False
-        elif self.quantity.choices:
-            how = {"choices": self.quantity.choices, "metavar": self.metavar}
+        elif self.choices:
+            how = {"choices": self.choices, "metavar": self.metavar}
         else:
-            how["metavar"] = self.metavar or self.quantity.unit.upper()
+            how["metavar"] = self.metavar or self.unit.upper()
             how["default"] = None if default in ("", NOT_GIVEN) else default
-            if self.quantity.is_number:
+            if self.is_number:
                 how["type"] = finite
-        group.add_argument(self.flag, dest=self.name, help=self.quantity.description, **how)
+        group.add_argument(flag_of(self), dest=self.name, help=self.description, **how)
 
     def values(self, given: Any) -> dict[str, Any]:
         """Return the parameters of relay_node that a value sets."""
-        if self.is_range:
+        if self.ends > 1:
             return dict(zip(self.parameters, given, strict=True))
         return dict.fromkeys(self.parameters, given)
 
 
 SETTINGS = (
     Setting(
-        Quantity("amplitude", 0.0, "u").means(
-            "half the distance of the two commands [u]; default: the node's parameter"
-        ),
-        "", "half the distance of the relay's two commands; 0: found by the tune", "0",
+        "amplitude", 0.0, "u", example="0",
+        question="half the distance of the relay's two commands; 0: found by the tune",
+    ).means("half the distance of the two commands [u]; default: the node's parameter"),
+    Setting("measurement", "", metavar="TOPIC").means("topic that measures"),
+    Setting("command", "", metavar="TOPIC").means("topic that commands the actuator"),
+    Setting(
+        "field", "data", metavar="PATH", question="the number that measures",
+        parameters=("measurement_field",),
+    ).means("the number in the messages of --measurement (%(default)s)"),
+    Setting("command_field", "", metavar="PATH", parameters=("command_field",)).means(
+        "the number in the messages of --command, such as linear.x"
+    ),
+    Setting("command_message", "", metavar="YAML", parameters=("command_message",)).means(
+        "what stands in their other elements, such as '{data: [0.0, 1.5]}'"
+    ),
+    Setting("command_period", NOT_GIVEN, "s", parameters=("command_period",)).means(
+        "send the last command again after this time, for an actuator that stops without"
     ),
     Setting(
-        Quantity("measurement", "").means("topic that measures"), "TOPIC",
-    ),
-    Setting(
-        Quantity("command", "").means("topic that commands the actuator"), "TOPIC",
-    ),
-    Setting(
-        Quantity("field", "data").means(
-            "the number in the messages of --measurement (%(default)s)"
-        ),
-        "PATH", "the number that measures", parameters=("measurement_field",),
-    ),
-    Setting(
-        Quantity("command_field", "").means(
-            "the number in the messages of --command, such as linear.x"
-        ),
-        "PATH", parameters=("command_field",),
-    ),
-    Setting(
-        Quantity("command_message", "").means(
-            "what stands in their other elements, such as '{data: [0.0, 1.5]}'"
-        ),
-        "YAML", parameters=("command_message",),
-    ),
-    Setting(
-        Quantity("command_period", NOT_GIVEN, "s").means(
-            "send the last command again after this time, for an actuator that stops without"
-        ),
-        parameters=("command_period",),
-    ),
-    Setting(
-        Quantity("at", NOT_GIVEN, "u").means("the present command, at which the process rests"),
+        "at", NOT_GIVEN, "u", question="present command, at which the process rests",
         # The safe command also where a controller_node in front of it has ended.
-        "", "present command, at which the process rests", "2.5", ("baseline", "safe_command"),
-    ),
+        example="2.5", parameters=("baseline", "safe_command"),
+    ).means("the present command, at which the process rests"),
     Setting(
-        Quantity("within", (), "y").means("the tune ends where the measurement leaves these [y]"),
-        "", "lowest and highest measurement that the process may see", "30 50",
-        ("measurement_min", "measurement_max"),
-    ),
+        "within", (), "y", question="lowest and highest measurement that the process may see",
+        example="30 50", parameters=("measurement_min", "measurement_max"),
+    ).means("the tune ends where the measurement leaves these [y]"),
     Setting(
-        Quantity("command_within", (), "u").means("no command beyond these is sent [u]"),
-        "", "lowest and highest command of the actuator", "0 5", ("command_min", "command_max"),
+        "command_within", (), "u", question="lowest and highest command of the actuator",
+        example="0 5", parameters=("command_min", "command_max"),
+    ).means("no command beyond these is sent [u]"),
+    Setting("law", "", choices=tuple(LAWS), metavar="LAW").means(
+        "design the gains for the law of another program, such as simple_pid, and prove them with "
+        "that law"
     ),
-    Setting(
-        Quantity("law", "", choices=tuple(LAWS)).means(
-            "design the gains for the law of another program, such as simple_pid, and prove them "
-            "with that law"
-        ),
-        "LAW",
+    Setting("sample_period", NOT_GIVEN, "s").means(
+        "time between two runs of that program [s]; default: that of the measurement"
     ),
-    Setting(
-        Quantity("sample_period", NOT_GIVEN, "s").means(
-            "time between two runs of that program [s]; default: that of the measurement"
-        ),
+    Setting("verify", False).means(
+        "prove the gains with a step of the set-point, by a controller_node of its own; without "
+        "either flag it asks, with --yes it does not"
     ),
-    Setting(
-        Quantity("verify", False).means(
-            "prove the gains with a step of the set-point, by a controller_node of its own; "
-            "without either flag it asks, with --yes it does not"
-        ),
+    Setting("step", NOT_GIVEN, "y").means(
+        "height of that step [y]; default: half of the swing of the tune, at least twenty times "
+        "the noise (forty if that is within a third of the way to a limit), as far as --within "
+        "and --command-within allow"
     ),
-    Setting(
-        Quantity("step", NOT_GIVEN, "y").means(
-            "height of that step [y]; default: half of the swing of the tune, at least twenty "
-            "times the noise (forty if that is within a third of the way to a limit), as far as "
-            "--within and --command-within allow"
-        ),
+    Setting("yes", False).means(
+        "do not ask, for scripts; gains are then proven with --verify alone"
     ),
-    Setting(
-        Quantity("yes", False).means(
-            "do not ask, for scripts; gains are then proven with --verify alone"
-        ),
-    ),
-    Setting(
-        Quantity("export", "").means(
-            "write the gains for ros2_controllers' pid_controller, or for the controller of the "
-            "joint; an existing file is refused at once"
-        ),
-        "FILE",
+    Setting("export", "", metavar="FILE").means(
+        "write the gains for ros2_controllers' pid_controller, or for the controller of the "
+        "joint; an existing file is refused at once"
     ),
 )  # fmt: skip
 SETTING = {each.name: each for each in SETTINGS}
-_FLAGS = {name: each.flag for each in SETTINGS for name in each.parameters}
+_FLAGS = {name: flag_of(each) for each in SETTINGS for name in each.parameters}
 # Where a checklist says which parameter of relay_node to set.
 _TYPED = re.compile(r"; type: ros2 param set \S+ (\w+) \w+$")
 
@@ -226,7 +182,7 @@ class Answers:
         """
         wanted = replace(self, options=argparse.Namespace(**vars(self.options)))
         for name, value in given.items():
-            found, ends = _numbers(value), 1 + SETTING[name].is_range
+            found, ends = _numbers(value), SETTING[name].ends
             if len(found) != ends or found != sorted(set(found)):
                 told = "two numbers, the lower one first" if ends > 1 else "one number"
                 raise SelectionError(f"{SETTING[name].question}: expected {told}")
@@ -243,14 +199,14 @@ class Answers:
 
     def source(self, name: str) -> str:
         """Return where a value comes from: its flag, unless something else was said."""
-        return self._from.get(name) or SETTING[name].flag
+        return self._from.get(name) or flag_of(SETTING[name])
 
     def now(self, name: str) -> str:
         """Return what is seen of a setting's quantity now; empty: nothing."""
         if name == "amplitude":
             return ""
         value = self.measured if name == "within" else self._present_command
-        return "" if math.isnan(value) else f"{value:.4g} {SETTING[name].quantity.unit} now"
+        return "" if math.isnan(value) else f"{value:.4g} {SETTING[name].unit} now"
 
     @property
     def _present_command(self) -> float:
@@ -294,12 +250,9 @@ class Answers:
         shown = "" if math.isnan(known) else f"{known:.6g}"
         example = example or shown or setting.example
         seen = "" if shown else self.now(name)
-        question = (
-            f"{what or setting.question} [{SETTING[name].quantity.unit}]"
-            + f", {seen}" * bool(seen)
-        )
+        question = f"{what or setting.question} [{SETTING[name].unit}]" + f", {seen}" * bool(seen)
         value = asked(
-            question, setting.flag, shown, example, setting.read,
+            question, flag_of(setting), shown, example, setting.read,
             lambda found: self.why_impossible(name, found),
         )  # fmt: skip
         self.take({name: value}, "typed")
@@ -316,9 +269,9 @@ class Answers:
             yield {
                 "name": name,
                 "question": setting.question,
-                "unit": SETTING[name].quantity.unit,
-                "values": value if setting.is_range else [value],
-                "ends": 1 + setting.is_range,
+                "unit": SETTING[name].unit,
+                "values": value if setting.ends > 1 else [value],
+                "ends": setting.ends,
                 "now": self.now(name),
             }
 
@@ -419,9 +372,8 @@ def kind_of(options: argparse.Namespace) -> Kind:
             each.name not in ("amplitude", "field", "yes")
             and getattr(options, each.name) is not None
         ):
-            raise SelectionError(
-                f"{each.flag} is for a loop without nodes: give --measurement and --command, too"
-            )
+            told = "is for a loop without nodes: give --measurement and --command, too"
+            raise SelectionError(f"{flag_of(each)} {told}")
     return Kind.NODES
 
 
