@@ -56,7 +56,14 @@ from relay_autotune.bag.mcap_records import (
     record_offsets,
     sorted_records,
 )
-from relay_autotune.bag.source import MAGIC, SQLITE_MAGIC, ZSTD_MAGIC, Source, expanding
+from relay_autotune.bag.source import (
+    MAGIC,
+    SQLITE_MAGIC,
+    ZSTD_MAGIC,
+    Source,
+    expanding,
+    open_regular,
+)
 from relay_autotune.errors import BagError
 from relay_autotune.text import visible
 
@@ -376,7 +383,7 @@ class McapFile(BagFile):
         """Note if the message indexes of a chunk do not list what it holds."""
         if piece.segment.index_end <= piece.segment.end:
             return
-        for channel in wanted:
+        for channel in wanted & (found.messages.keys() | piece.listed.keys()):
             own = found.messages.get(channel)
             there = _NOWHERE if own is None else own.order
             there = there[np.searchsorted(there, begin) : np.searchsorted(there, stop)]
@@ -401,6 +408,19 @@ _ROWS = 4 << 20
 _STEPS = 10_000
 
 
+# With what the journal of a change begins that was not finished.
+_JOURNAL_MAGIC = bytes.fromhex("d9d505f920a163d7")
+
+
+def _is_hot(journal: Path) -> bool:
+    """Return whether a journal holds what a change has overwritten."""
+    try:
+        with open_regular(journal) as file:
+            return file.read(len(_JOURNAL_MAGIC)) == _JOURNAL_MAGIC
+    except BagError:
+        return False
+
+
 class SqliteFile(BagFile):
     """A ``.db3`` file of rosbag2 open for reading.
 
@@ -420,6 +440,12 @@ class SqliteFile(BagFile):
         if self.path.with_name(self.path.name + "-wal").exists():
             self.notes.append(
                 f"{self.path.name}-wal holds the end of the recording and is not read"
+            )
+        if _is_hot(self.path.with_name(self.path.name + "-journal")):
+            self.notes.append(
+                f"{self.path.name} was cut within a change of it, which its -journal would undo "
+                f"and which is read as it is: messages may be missing at the end, or make no "
+                f"sense; sqlite3 {self.path.name} .tables undoes it"
             )
         try:
             self._database = self._connected()
@@ -546,8 +572,10 @@ class SqliteFile(BagFile):
     def _runs(
         self, rows: list[tuple[int, int, bytes]], before: int
     ) -> Iterator[tuple[int, int, Messages]]:
-        for channel in dict.fromkeys(row[0] for row in rows):
-            own = [(k, row) for k, row in enumerate(rows) if row[0] == channel]
+        by_channel: dict[int, list[tuple[int, tuple[int, int, bytes]]]] = {}
+        for k, row in enumerate(rows):
+            by_channel.setdefault(row[0], []).append((k, row))
+        for channel, own in by_channel.items():
             end = np.cumsum([len(row[2]) for _, row in own], dtype=np.int64)
             time: Any = np.array([row[1] for _, row in own], dtype=np.int64)
             messages = Messages(

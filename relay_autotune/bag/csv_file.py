@@ -63,6 +63,11 @@ _MOST_CHOICES = 6
 _RESTART = 10
 # From row to row, a time without a unit that steps more is not in seconds [s].
 _LONGEST_STEP = 3600.0
+# Range of a counter of milliseconds or microseconds, and what its numbers may be divided by.
+_COUNTERS = (2.0**32, 2.0**16)
+_COUNTED = (1.0, 1e-3, 1e-6)
+# Usual steps from the last time before a counter wraps around to the first one behind it.
+_FEW_STEPS = 3.0
 # Smallest jump of a command that steps, as a share of its range, and largest share of rows with
 # a change.
 _JUMP, _MOVING = 0.05, 0.2
@@ -220,7 +225,7 @@ def _nanoseconds(
         half_day = 43200 * 10**9
         midnights = np.cumsum(np.diff(clock, prepend=clock[0]) < -half_day)
         return clock + 2 * half_day * midnights, False
-    time = np.array(times.numbers)
+    time = _unwrapped(np.array(times.numbers), name, notes)
     largest = float(np.abs(time).max())
     step = float(np.median(np.abs(np.diff(time))))
     unit = given or _unit_of(name)
@@ -255,6 +260,19 @@ def _nanoseconds(
     whole = np.floor(time)
     ns = whole.astype(np.int64) * int(scale) + np.round((time - whole) * scale).astype(np.int64)
     return ns, bool(ns[0] > EPOCH * 1e9)
+
+
+def _unwrapped(time: FloatArray, name: str, notes: list[str]) -> FloatArray:
+    """Return times of a counter of 16 or 32 bits as if it had more, so that they go on rising."""
+    moves = np.diff(time)
+    step = float(np.median(np.abs(moves)))
+    for range_ in (bits * unit for bits in _COUNTERS for unit in _COUNTED):
+        wraps = np.abs(moves + range_) <= _FEW_STEPS * step
+        inside = float(time.min()) >= 0.0 and float(time.max()) <= range_
+        if step < range_ / 100.0 and inside and bool(wraps.any()):
+            notes.append(f"the column {name!r} wraps around at {range_:.10g} and is counted on")
+            return time + range_ * np.append(0, np.cumsum(wraps))
+    return time
 
 
 def _unit_of(name: str) -> str | None:

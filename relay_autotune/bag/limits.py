@@ -44,6 +44,9 @@ MOST_STEPS = 5_000
 # Bytes of the index at the end of a file.
 LARGEST_SUMMARY = 256 << 20
 
+# Topics of one number among which measurement and command are looked for: each pair is one try.
+MOST_SEARCHED = 1000
+
 # Messages of a topic for which memory is set aside because the file says that it has them.
 MOST_EXPECTED = 1 << 27
 

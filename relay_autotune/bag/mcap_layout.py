@@ -28,7 +28,7 @@ from relay_autotune.bag.mcap_records import (
     Opcode,
     every_byte,
     record_offsets,
-    sorted_records,
+    summed_up,
     text,
     unsigned,
 )
@@ -102,10 +102,8 @@ class ChunkIndex:
         :param channels: the ids of those that are wanted.
         :param counts: number of messages of each channel, by the statistics.
         """
-        return all(
-            int(self.listed[self.channel == channel].sum()) == counts.get(channel, 0)
-            for channel in channels
-        )
+        listed = np.bincount(self.channel, self.listed, 1 << 16)
+        return all(listed[channel] == counts.get(channel, 0) for channel in channels)
 
 
 @dataclass
@@ -309,15 +307,15 @@ class _Scan:
         offsets, _ = record_offsets(content)
         # Before they take several times the memory of the content.
         self.source.count_messages(self.count + offsets.size - MOST_DECLARATIONS)
-        found = sorted_records(content, offsets, None, ())
+        channels, times, others = summed_up(content, offsets)
         with contextlib.suppress(DamageError):
-            self.layout.declared.take_all(content, found.others)
-        for messages in found.messages.values():
-            self.count += len(messages)
-            first = int(messages.log_time.min())
+            self.layout.declared.take_all(content, others)
+        if times.size:
+            self.count += times.size
+            first = int(times.min())
             self.first = first if self.first is None else min(self.first, first)
-            self.last = max(self.last, int(messages.log_time.max()))
-        return frozenset(found.messages)
+            self.last = max(self.last, int(times.max()))
+        return frozenset(channels.tolist())
 
     def _loose(self, position: int) -> int:
         """Take a piece of records outside of chunks; return where the next one begins."""

@@ -225,6 +225,8 @@ _INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 # Records of one size that must follow each other before a longer run of them is looked for.
 _RUN = 4
 _LONGEST_RUN = 1 << 16
+# Number of channels up to which each one's messages are looked for among all.
+_FEW = 16
 _NOWHERE: IntArray = np.empty(0, dtype=np.int64)
 
 
@@ -379,15 +381,44 @@ class Sorted:
 
 
 def sorted_records(
-    content: Content, offsets: IntArray, wanted: Collection[int] | None, declared: Collection[int]
+    content: Content, offsets: IntArray, wanted: Collection[int], declared: Collection[int]
 ) -> Sorted:
     """Tell messages by their channels, and from other records.
 
     :param content: the records.
     :param offsets: where each begins.
-    :param wanted: the channels whose messages are wanted; None: all of them.
+    :param wanted: the channels whose messages are wanted.
     :param declared: the channels that there are.
     """
+    places, heads, others, short = _message_heads(content, offsets)
+    channels = np.ascontiguousarray(heads["channel"])
+    known = np.zeros(1 << 16, dtype=np.bool_)
+    known[list(declared)] = True
+    found: dict[int, Messages] = {}
+    for number, own in _by_channel(channels, wanted):
+        at, of_it = places[own], heads[own]
+        end = at + RECORD.size + of_it["length"].astype(np.int64)
+        found[number] = _messages_at(content, at, of_it, end)
+    return Sorted(found, others, places[~known[channels]], short)
+
+
+def summed_up(content: Content, offsets: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Return what the messages among some records are, without taking them apart.
+
+    :param content: the records.
+    :param offsets: where each begins.
+    :return: the channels that have messages; the time at which each message was recorded [ns];
+        where the other records begin.
+    """
+    _, heads, others, _ = _message_heads(content, offsets)
+    used = np.flatnonzero(np.bincount(heads["channel"]))
+    return used, nanoseconds(heads["log_time"]), others
+
+
+def _message_heads(
+    content: Content, offsets: IntArray
+) -> tuple[IntArray, NDArray[Any], IntArray, int]:
+    """Return where messages begin, and their heads; where others do; the number of short ones."""
     is_message = _opcodes(content, offsets) == Opcode.MESSAGE
     others, places = offsets[~is_message], _chosen(offsets, is_message)
     # Nearer to the end of the content only one that is too short begins.
@@ -395,20 +426,24 @@ def sorted_records(
     heads = _heads(content, places[: np.searchsorted(places, last, side="right")])
     whole = heads["length"] >= MESSAGE_HEAD_SIZE
     short = places.size - int(np.count_nonzero(whole))
-    places, heads = _chosen(places[: heads.size], whole), _chosen(heads, whole)
-    channels = np.ascontiguousarray(heads["channel"])
-    known = np.zeros(1 << 16, dtype=np.bool_)
-    known[list(declared)] = True
-    unknown = places[~known[channels]]
-    chosen = np.flatnonzero(np.bincount(channels)).tolist() if wanted is None else sorted(wanted)
-    found: dict[int, Messages] = {}
-    for number in chosen:
-        own = np.flatnonzero(channels == number)
-        if own.size:
-            at, of_it = places[own], heads[own]
-            end = at + RECORD.size + of_it["length"].astype(np.int64)
-            found[number] = _messages_at(content, at, of_it, end)
-    return Sorted(found, others, unknown, short)
+    return _chosen(places[: heads.size], whole), _chosen(heads, whole), others, short
+
+
+def _by_channel(
+    channels: NDArray[np.uint16], wanted: Collection[int]
+) -> Iterator[tuple[int, IntArray]]:
+    """Yield each wanted channel that has messages, and which ones are its."""
+    if len(wanted) <= _FEW:
+        for number in sorted(wanted):
+            own = np.flatnonzero(channels == number)
+            if own.size:
+                yield number, own
+        return
+    # To look through all messages for each of many channels takes hours.
+    order = np.argsort(channels, kind="stable")
+    ends = np.cumsum(np.bincount(channels))
+    for number in sorted(set(wanted) & set(np.unique(channels).tolist())):
+        yield number, order[ends[number - 1] if number else 0 : ends[number]]
 
 
 def listed_records(

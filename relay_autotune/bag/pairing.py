@@ -27,6 +27,7 @@ from relay_autotune.bag.field_path import (
     steps_of,
     written,
 )
+from relay_autotune.bag.limits import MOST_SEARCHED
 from relay_autotune.bag.signals import Selection, Signal, flags_of
 from relay_autotune.bag.topics import Topics, split_name
 from relay_autotune.errors import FieldError, SelectionError
@@ -116,6 +117,12 @@ def pair_of(topics: Topics, wanted: Selection) -> tuple[tuple[str, str], list[st
         return names, notes
     role, named = ("command", command) if measurement is None else ("measurement", measurement)
     given = None if named is None else _checked(topics, role, named)
+    if (count := len(topics.single_numbers())) > MOST_SEARCHED:
+        raise SelectionError(
+            f"{topics.path} has {count} topics whose messages are about one number, and "
+            f"measurement and command are looked for among {MOST_SEARCHED} at most; name them "
+            f"with --measurement TOPIC --command TOPIC"
+        )
     signals = [timed.signal for timed in topics.signals().values()]
     return _only(topics, plausible_pairs(signals, **({} if given is None else {role: given})))
 

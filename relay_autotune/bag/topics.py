@@ -71,6 +71,7 @@ class Topics:
     progress: Progress | None = None
     _signals: dict[str, TimedSignal] = field(default_factory=dict)
     _types: dict[tuple[str, str, str, bytes], Struct] = field(default_factory=dict)
+    _by_topic: dict[str, list[tuple[int, Channel]]] = field(default_factory=dict)
     _defined: int = 0
 
     @property
@@ -266,12 +267,13 @@ class Topics:
 
     def _channels(self, topic: str | None = None) -> list[tuple[int, Channel]]:
         """Return the channels of a topic, or of all, each after the number of its file."""
-        return [
-            (number, channel)
-            for number, file in enumerate(self.files)
-            for channel in file.channels.values()
-            if topic in (None, channel.topic)
-        ]
+        if not self._by_topic:
+            for number, file in enumerate(self.files):
+                for channel in file.channels.values():
+                    self._by_topic.setdefault(channel.topic, []).append((number, channel))
+        if topic is not None:
+            return self._by_topic.get(topic, [])
+        return [each for own in self._by_topic.values() for each in own]
 
     def _type(self, channel: Channel) -> Struct:
         key = (channel.type, channel.encoding, channel.schema_encoding, channel.definition)

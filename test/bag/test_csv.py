@@ -403,3 +403,20 @@ def test_a_date_beyond_nanoseconds_is_a_sentence(tmp_path, year):
     body = "".join(f"{year}-06-01 00:00:{k:02},{k % 7},{k // 5 % 2}\n" for k in range(20))
     with pytest.raises(BagError, match="before 1678 or after 2262"):
         read_experiments(write(tmp_path / "a.csv", f"time,y,u\n{body}"))
+
+
+@pytest.mark.parametrize(
+    ("header", "begin", "step", "range_", "unit"),
+    [
+        ("millis", 2**32 - 3050, 100, 2**32, 1e-3),
+        ("time [ms]", 2**16 - 2010, 100, 2**16, 1e-3),
+        ("time", 4294.0, 0.1, 4294.967296, 1.0),
+    ],
+)
+def test_a_counter_that_wraps_around_is_counted_on(tmp_path, header, begin, step, range_, unit):
+    ticks = [(begin + k * step) % range_ for k in range(60)]
+    text = "".join(f"{t!r},{k % 7},{k // 5 % 2}\n" for k, t in enumerate(ticks))
+    found = read_experiments(write(tmp_path / "a.csv", f"{header},y,u\n{text}"))
+    (record,) = found.experiments
+    np.testing.assert_allclose(record.time, np.arange(60) * step * unit, atol=1e-6)
+    assert any("wraps around at" in note for note in found.notes)

@@ -6,16 +6,19 @@
 from __future__ import annotations
 
 import sqlite3
+import time
 
 import numpy as np
 import pytest
 import zstandard
 
 from relay_autotune.bag import bag_file
+from relay_autotune.bag.bag_file import SqliteFile
 from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.signals import Selection
+from relay_autotune.bag.topics import Topics
 from relay_autotune.bag.writer import encode_float64
-from relay_autotune.errors import BagError
+from relay_autotune.errors import BagError, SelectionError
 
 NAMES = Selection("/y", "/u")
 DEFINITION = "float64 data\n"
@@ -43,11 +46,11 @@ def bag(path, first=0, last=60, *, definitions=True, pack=bytes):
             "INSERT INTO topics VALUES(?, ?, 'std_msgs/msg/Float64', 'cdr', '')", (number, name)
         )
     for k in range(first, last):
-        time = 1_790_000_000_000_000_000 + k * 100_000_000
+        stamp = 1_790_000_000_000_000_000 + k * 100_000_000
         for topic, value in ((1, k % 7 + 0.5), (2, float(k // 5 % 2))):
             database.execute(
                 "INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)",
-                (topic, time, pack(encode_float64(value))),
+                (topic, stamp, pack(encode_float64(value))),
             )
     database.commit()
     database.close()
@@ -169,6 +172,38 @@ def test_more_topics_than_a_recorder_has_are_refused(tmp_path):
         " INSERT INTO topics SELECT k, '/t' || k, 'x', 'cdr', '' FROM n",
     )
     assert "declares more than 50000 topics" in said
+
+
+def test_many_topics_take_no_longer_and_are_not_paired(tmp_path):
+    path = bag(tmp_path / "a.db3")
+    database = sqlite3.connect(path)
+    numbers = "WITH RECURSIVE n(k) AS (SELECT 3 UNION ALL SELECT k + 1 FROM n WHERE k < 20000)"
+    database.execute(
+        f"{numbers} INSERT INTO topics SELECT k, '/t' || k, 'std_msgs/msg/Float64', 'cdr', '' "
+        "FROM n"
+    )
+    database.execute(
+        f"{numbers} INSERT INTO messages SELECT k + 1000, k, 1790000000000000000, ? FROM n",
+        (encode_float64(1.0),),
+    )
+    database.commit()
+    database.close()
+    begin = time.process_time()
+    check(path)
+    with pytest.raises(SelectionError, match="has 20000 topics whose messages are about one numb"):
+        read_experiments(path)
+    with SqliteFile(path) as file:
+        found = Topics(path, [file]).signals()
+    assert len(found) == 20_000
+    assert time.process_time() - begin < 10.0
+
+
+@pytest.mark.parametrize("begin", [bytes.fromhex("d9d505f920a163d7"), bytes(8)])
+def test_a_change_that_was_cut_is_said(tmp_path, begin):
+    path = bag(tmp_path / "a.db3")
+    (tmp_path / "a.db3-journal").write_bytes(begin + bytes(504))
+    notes = read_experiments(path, NAMES).notes
+    assert any("was cut within a change" in note for note in notes) == any(begin)
 
 
 def test_pages_that_lead_to_the_same_rows_again_and_again_end(tmp_path, monkeypatch):
