@@ -31,9 +31,9 @@ import numpy as np
 from made_recordings import seeds
 from markdown import table, three
 
-from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.signals import Selection
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.recordings import read_experiments
 
 COUNT, QUICK_COUNT = 20_000, 60
 SECONDS, MEGABYTES = 5.0, 1000.0

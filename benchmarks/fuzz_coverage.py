@@ -31,9 +31,9 @@ def main() -> int:
         print("fuzz_coverage: not run: atheris is not installed: pip install atheris")
         return 0
     with atheris.instrument_imports(include=["relay_autotune"]):
-        from relay_autotune.bag.reader import read_experiments
         from relay_autotune.bag.signals import Selection
         from relay_autotune.errors import RelayAutotuneError
+        from relay_autotune.recordings import read_experiments
     from made_recordings import seeds
 
     folder = Path(tempfile.mkdtemp(prefix="fuzz_"))

@@ -28,9 +28,9 @@ import zstandard
 from fuzz_bags import Trial, run
 from made_recordings import seeds
 
-from relay_autotune.bag.reader import Recording, read_experiments
 from relay_autotune.bag.signals import Selection
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.recordings import Recording, read_experiments
 
 T = TypeVar("T")
 

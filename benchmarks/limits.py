@@ -378,8 +378,8 @@ def made_records(count: int) -> Iterator[tuple[str, Any]]:
 
 def recorded(folder: Path) -> Iterator[tuple[str, Any]]:
     """Yield the records of a folder that hold one experiment."""
-    from relay_autotune.bag.reader import read_records
     from relay_autotune.errors import RelayAutotuneError
+    from relay_autotune.recordings import read_records
 
     for path in sorted(folder.glob("*.csv")):
         try:

@@ -34,11 +34,11 @@ import numpy as np
 from markdown import table, three
 
 from relay_autotune.analysis import analyse
-from relay_autotune.bag.reader import read_records
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.loop.analysis import ms_on
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Record
+from relay_autotune.recordings import read_records
 from relay_autotune.result import Analysis
 
 _MOST_SECONDS = 300.0

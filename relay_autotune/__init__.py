@@ -30,7 +30,6 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from relay_autotune.analysis import analyse, analyse_jointly
-    from relay_autotune.bag.reader import read_records
     from relay_autotune.errors import RelayAutotuneError
     from relay_autotune.exchange.models import to_control
     from relay_autotune.experiment.experiment import RelayExperiment
@@ -44,6 +43,7 @@ if TYPE_CHECKING:
     from relay_autotune.process.ultimate import ultimate_point
     from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
     from relay_autotune.record.record import Outcome, PiecewiseConstant, Record, RelaySettings
+    from relay_autotune.recordings import read_records
     from relay_autotune.report import draw, write_report
     from relay_autotune.result import Analysis
     from relay_autotune.tuning import RULES, Controller, DesignOptions, Gains, tune
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "analysis": ("analyse", "analyse_jointly"),
     "result": ("Analysis",),
-    "bag.reader": ("read_records",),
+    "recordings": ("read_records",),
     "errors": ("RelayAutotuneError",),
     "identification.known": ("Known",),
     "identification.methods": ("METHODS", "identify"),

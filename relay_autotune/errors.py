@@ -87,6 +87,23 @@ class NotReadyError(RelayAutotuneError):
     """A tune, or a verification, that cannot start."""
 
 
+def visible(text: str, keep: str = "") -> str:
+    """Return a text with each unprintable character as an escape sequence of Python.
+
+    These are control characters, line breaks, marks of the direction of writing, characters
+    without width, and bytes that were no text. Visible characters stay unchanged.
+
+    :param text: the text.
+    :param keep: unprintable characters that stay unchanged.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        char if char.isprintable() or char in keep else char.encode("unicode_escape").decode()
+        for char in text
+    )
+
+
 def defect(error: BaseException) -> str:
     """Return the message for an unexpected error: a request to report it, with its place.
 

@@ -15,6 +15,8 @@ from __future__ import annotations
 import math
 from datetime import UTC, datetime
 
+from relay_autotune.errors import visible as visible
+
 # Half a unit of the fourth digit of 9999, the finest of four digits.
 _FINEST = 5e-5
 
@@ -79,23 +81,6 @@ def date_text(start: float) -> str:
 
 # A spreadsheet takes a cell that begins with one of these for a formula.
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
-
-
-def visible(text: str, keep: str = "") -> str:
-    """Return a text with each unprintable character as an escape sequence of Python.
-
-    These are control characters, line breaks, marks of the direction of writing, characters
-    without width, and bytes that were no text. Visible characters stay unchanged.
-
-    :param text: the text.
-    :param keep: unprintable characters that stay unchanged.
-    """
-    if text.isprintable():
-        return text
-    return "".join(
-        char if char.isprintable() or char in keep else char.encode("unicode_escape").decode()
-        for char in text
-    )
 
 
 def cell(text: str) -> str:

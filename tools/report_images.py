@@ -19,11 +19,11 @@ from pathlib import Path
 from PIL import Image
 
 from relay_autotune.analysis import analyse
-from relay_autotune.bag.reader import read_experiments
 from relay_autotune.cli import demo
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.recordings import read_experiments
 from relay_autotune.report import write_page, write_picture
 from relay_autotune.report.case import Case, case_of
 from relay_autotune.report.figures import PLATES

@@ -25,7 +25,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from relay_autotune.arrays import IntArray
+from relay_autotune.bag.arrays import IntArray
 from relay_autotune.bag.definitions import find_definition
 from relay_autotune.bag.limits import (
     LARGEST_CHUNK,
@@ -64,8 +64,7 @@ from relay_autotune.bag.source import (
     expanding,
     open_regular,
 )
-from relay_autotune.errors import BagError
-from relay_autotune.text import visible
+from relay_autotune.errors import BagError, visible
 
 # Size of the expanded messages that are handed on together [bytes].
 _EXPANDED = 16 << 20

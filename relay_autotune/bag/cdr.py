@@ -11,18 +11,17 @@ fixed size do, a place is one number; else it is one for each message.
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.arrays import IntArray
-from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, first_line, message_type
+from relay_autotune.bag.arrays import IntArray
+from relay_autotune.bag.definitions import first_line, message_type
 from relay_autotune.bag.field_path import (
     Element,
     Number,
@@ -36,10 +35,7 @@ from relay_autotune.bag.field_path import (
 )
 from relay_autotune.bag.limits import MOST_ELEMENTS, MOST_STEPS
 from relay_autotune.bag.mcap_records import Channel, Content, every_byte
-from relay_autotune.errors import BagError, FieldError
-from relay_autotune.quantities import told_fields
-from relay_autotune.record.record import Cycle, RelaySettings
-from relay_autotune.text import visible
+from relay_autotune.errors import BagError, FieldError, visible
 
 _ENCAPSULATION = 4
 _UINT32 = Number("uint32", "u4")
@@ -354,47 +350,15 @@ _FORMATS = {
     "f4": "f", "f8": "d",
 }  # fmt: skip
 
-_STAMP = {"sec": 0, "nanosec": 0}
-_HEADER: dict[str, Any] = {"stamp": _STAMP, "frame_id": ""}
 
-
-def _told(kind: type) -> dict[str, Any]:
-    """Return the fields that a message has of one of our types, each with its default."""
-    fields = [each for each in told_fields(kind) if each.message is not None]
-    absent = {each.name: math.nan if each.nan else each.kind() for each in fields}
-    given = {each.name: each.default for each in fields if each.default is not MISSING}
-    return absent | given
-
-
-# Defaults of the fields that an older definition lacks. A field that is added to one of these
-# messages needs its default here, so that old bags can still be replayed.
-DEFAULTS: dict[str, dict[str, Any]] = {
-    EXPERIMENT: {
-        "header": _HEADER,
-        "settings": _told(RelaySettings),
-        "noise_std": math.nan,
-        "sought_width": 0.0,
-        **dict.fromkeys(("experiment_id", "reason", "sought"), ""),
-        **dict.fromkeys(("outcome", "lost_samples"), 0),
-        **dict.fromkeys(("time", "receive_time", "command_time"), ()),
-        **dict.fromkeys(("measurement", "command", "cycle_start"), ()),
-    },
-    CYCLE: {
-        "header": _HEADER,
-        "settings": _told(RelaySettings),
-        "experiment_id": "",
-        "lead_in": 0,
-        **dict.fromkeys(("time", "measurement", "command"), ()),
-        **_told(Cycle),
-    },
-}
-
-
-def decode_messages(channel: Channel, payload: Iterable[bytes]) -> list[Any]:
-    """Decode messages by the definition in their bag; fields it lacks get their defaults.
+def decode_messages(
+    channel: Channel, payload: Iterable[bytes], defaults: Mapping[str, Any]
+) -> list[Any]:
+    """Decode messages by the definition in their bag.
 
     :param channel: the channel of the messages.
     :param payload: the serialized messages.
+    :param defaults: values of the fields that an older definition lacks, by their names.
     :return: objects with the fields as attributes, more than today's if the bag has more.
     :raises BagError: if the definition or a message makes no sense.
     """
@@ -404,7 +368,7 @@ def decode_messages(channel: Channel, payload: Iterable[bytes]) -> list[Any]:
             f"{channel.schema_encoding!r}; expected 'cdr' with 'ros2msg'"
         )
     root = message_type(channel)
-    budget, defaults = _Budget(), DEFAULTS.get(channel.type, {})
+    budget = _Budget()
     return [
         _with_defaults(decoded_message(root, data, f" of {channel.topic}", budget), defaults)
         for data in payload

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from relay_autotune.arrays import FloatArray, IntArray
+from relay_autotune.bag.arrays import FloatArray, IntArray
 from relay_autotune.bag.signals import TIME_UNITS, Selection, Signal, flags_of
 from relay_autotune.bag.source import open_regular
 from relay_autotune.bag.text_table import TextTable, Times, listed
@@ -89,6 +90,45 @@ class Log:
     notes: tuple[str, ...] = ()
 
 
+@contextmanager
+def _table(path: Path) -> Iterator[TextTable]:
+    """Give the table in a file, and sentences for what else may be in it."""
+    try:
+        with open_regular(path) as file:
+            yield TextTable(path, file)
+    except OSError as error:
+        raise BagError(f"cannot read {path}: {error.strerror or error}") from error
+    except UnicodeError:
+        raise BagError(f"{path} is not a text file; expected CSV in UTF-8") from None
+    except csv.Error as error:
+        raise BagError(f"{path} is not a CSV file: {error}") from None
+
+
+def read_columns(path: Path, columns: Sequence[str] | None = None) -> dict[str, Signal]:
+    """Return columns of a text as signals, by their names, their rows in the order of their time.
+
+    :param path: the file.
+    :param columns: their names; default: all but that of the time.
+    :raises SelectionError: if one is not there.
+    :raises BagError: if the file cannot be read, or holds anything but numbers.
+    """
+    with _table(path) as table:
+        time = _time(path, table.names, Selection(), ())
+        assert time is not None
+        names = table.names if columns is None else columns
+        places = [_named(path, table.names, name) for name in names]
+        places = [at for at in places if columns is not None or at != time]
+        times, values = table.columns(time, places)
+    name = table.names[time]
+    time_ns, _ = _nanoseconds(path, name, times, table.units.get(name), [])
+    order = np.argsort(time_ns, kind="stable")
+    found = {}
+    for at, column in zip(places, values, strict=True):
+        kept = order[~np.isnan(column[order])]
+        found[table.names[at]] = Signal(table.names[at], time_ns[kept], column[kept])
+    return found
+
+
 def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
     """Return measurement and command of each recording in a text with columns.
 
@@ -102,17 +142,9 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
     :raises SelectionError: if a column is not named, or not there.
     :raises BagError: if the file cannot be read, or holds anything but numbers.
     """
-    try:
-        with open_regular(path) as file:
-            table = TextTable(path, file)
-            time, pair = _choose(path, table.names, wanted)
-            times, (y, u) = table.columns(time, pair)
-    except OSError as error:
-        raise BagError(f"cannot read {path}: {error.strerror or error}") from error
-    except UnicodeError:
-        raise BagError(f"{path} is not a text file; expected CSV in UTF-8") from None
-    except csv.Error as error:
-        raise BagError(f"{path} is not a CSV file: {error}") from None
+    with _table(path) as table:
+        time, pair = _choose(path, table.names, wanted)
+        times, (y, u) = table.columns(time, pair)
     notes = table.notes
     names = [table.names[at] for at in pair]
     if wanted.measurement is None and wanted.command is None:
@@ -322,41 +354,29 @@ def _choose(path: Path, names: Sequence[str], wanted: Selection) -> tuple[int | 
     """Return the places of the time, None without one, and of measurement and command."""
     given = (wanted.measurement, wanted.command)
     pair = [_named(path, names, name) for name in given if name is not None]
-    if wanted.time is not None and wanted.period is not None:
-        raise SelectionError("--period is for a file without times; leave out --time or --period")
-    if wanted.period is not None and not wanted.period > 0.0:
-        raise SelectionError(
-            f"--period {wanted.period:g} is no time from row to row; expected > 0"
-        )
-    time = None
-    if wanted.time is not None:
-        time = _named(path, names, wanted.time)
-    elif wanted.period is None:
-        free = [k for k, name in enumerate(names) if k not in pair and _is_time(name)]
-        time = free[0] if free and not _is_time(names[0]) else 0
-    if len(pair) < 2:
-        rest = [k for k in range(len(names)) if k != time]
-        if len(rest) != 2 or pair:
-            least = (
-                "; expected time, measurement and command, or two columns and their sampling "
-                "period with --period S"
-                if len(names) < 3
-                else "; name two of them with --measurement NAME --command NAME"
-                + ("" if time is None else f", and --time NAME if it is not {names[time]!r}")
-                + ", such as"
-            )
-            raise SelectionError(
-                f"{path} has {len(names)} columns: {listed(names)}{least}",
-                _choices([names[k] for k in rest], given),
-            )
+    time = _time(path, names, wanted, pair)
+    rest = [k for k in range(len(names)) if k != time]
+    if not pair and len(rest) == 2:
         pair = rest
-    if time is not None and time in pair and wanted.time is None:
+    if len(pair) < 2:
+        least = (
+            "; expected time, measurement and command, or two columns and their sampling "
+            "period with --period S"
+        )
+        if len(names) >= 3:
+            other = "" if time is None else f", and --time NAME if it is not {names[time]!r}"
+            least = f"; name two of them with --measurement NAME --command NAME{other}, such as"
+        raise SelectionError(
+            f"{path} has {len(names)} columns: {listed(names)}{least}",
+            _choices([names[k] for k in rest], given),
+        )
+    if time in pair and wanted.time is None:
         raise SelectionError(
             f"{path} has no column that is named as a time: {listed(names)}; name it with --time "
             "NAME, or, if there is none, give the sampling period with --period S"
         )
-    for name in (names[at] for at in pair):
-        _named(path, names, name)
+    for at in pair:
+        _named(path, names, names[at])
     if len({time, *pair}) < 3:
         chosen = [names[at] for at in (time, *pair) if at is not None]
         raise SelectionError(
@@ -364,6 +384,28 @@ def _choose(path: Path, names: Sequence[str], wanted: Selection) -> tuple[int | 
             f"found {listed(chosen)}"
         )
     return time, pair
+
+
+def _time(path: Path, names: Sequence[str], wanted: Selection, taken: Sequence[int]) -> int | None:
+    """Return the place of the time; None: rows have none, and come one period after another.
+
+    :param taken: places of columns that are named as something else.
+    """
+    if wanted.period is not None:
+        if wanted.time is not None:
+            raise SelectionError(
+                "--period is for a file without times; leave out --time or --period"
+            )
+        if not wanted.period > 0.0:
+            raise SelectionError(
+                f"--period {wanted.period:g} is no time from row to row; expected > 0"
+            )
+        return None
+    if wanted.time is not None:
+        return _named(path, names, wanted.time)
+    # The first column, unless only another one is called so.
+    called_so = [k for k, name in enumerate(names) if k not in taken and _is_time(name)]
+    return called_so[0] if called_so and not _is_time(names[0]) else 0
 
 
 def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[tuple[str, str]]:

@@ -26,8 +26,7 @@ from pathlib import Path
 from relay_autotune.bag.field_path import Fields, Repeated, Struct, Text, Type, number_named
 from relay_autotune.bag.limits import DEEPEST_TYPE, LARGEST_DEFINITION, MOST_FIELDS
 from relay_autotune.bag.mcap_records import Channel
-from relay_autotune.errors import BagError
-from relay_autotune.text import visible
+from relay_autotune.errors import BagError, visible
 
 _TOKEN = re.compile(
     r"""\s+ | //[^\n]* | /\*.*?\*/                                  # nothing

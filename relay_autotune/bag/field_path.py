@@ -25,8 +25,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from relay_autotune.errors import FieldError
-from relay_autotune.text import visible
+from relay_autotune.errors import FieldError, visible
 
 _FORMS = {
     **dict.fromkeys(("bool", "byte", "octet", "char"), "u1"),

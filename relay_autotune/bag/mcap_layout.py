@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.arrays import IntArray
+from relay_autotune.bag.arrays import IntArray
 from relay_autotune.bag.limits import LARGEST_SUMMARY, LARGEST_WINDOW, MOST_DECLARATIONS
 from relay_autotune.bag.mcap_records import (
     FOOTER_SIZE,

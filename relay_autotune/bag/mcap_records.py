@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.arrays import IntArray
+from relay_autotune.bag.arrays import IntArray
 from relay_autotune.bag.limits import MOST_DECLARATIONS, MOST_DECLARED
-from relay_autotune.errors import BagError
-from relay_autotune.text import visible
+from relay_autotune.errors import BagError, visible
 
 
 class Opcode:

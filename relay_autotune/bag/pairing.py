@@ -30,8 +30,7 @@ from relay_autotune.bag.field_path import (
 from relay_autotune.bag.limits import MOST_SEARCHED
 from relay_autotune.bag.signals import Selection, Signal, flags_of
 from relay_autotune.bag.topics import Topics, split_name
-from relay_autotune.errors import FieldError, SelectionError
-from relay_autotune.text import visible
+from relay_autotune.errors import FieldError, SelectionError, visible
 
 _WORDS = {
     "set-point": "setpoint reference ref target desired goal",

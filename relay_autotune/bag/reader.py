@@ -1,109 +1,84 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The experiments in a recording: those of relay_node, also one cut short, or of any program."""
+"""Recordings on disk: which files they are, opened as one timeline, and their signals."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from relay_autotune.arrays import IntArray
 from relay_autotune.bag.bag_file import BagFile, McapFile
-from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, EXPERIMENT_METADATA, FLOAT64
-from relay_autotune.bag.signals import Selection, join, preceded, window
+from relay_autotune.bag.limits import LARGEST_CHUNK
+from relay_autotune.bag.signals import CLOCKS, Signal
 from relay_autotune.bag.source import known_start, open_regular
 from relay_autotune.bag.topics import Progress, Topics
-from relay_autotune.errors import BagError, RecordError, RelayAutotuneError, SelectionError
-from relay_autotune.exchange.messages import (
-    record_from_message,
-    settings_from_message,
-    stamp_nanoseconds,
-    start_seconds,
-)
-from relay_autotune.record.record import Outcome, Record
+from relay_autotune.errors import BagError, RelayAutotuneError
 
 _STORED = (".mcap", ".db3")
 # A file compressed as a whole, as rosbag2 and the zstd command name it.
 _WHOLE = tuple([kind, end] for kind in _STORED for end in (".zstd", ".zst"))
 
 
-@dataclass(frozen=True)
-class Recording:
-    """What was found in one recording.
-
-    :param path: as it was given.
-    :param experiments: the records, at least one.
-    :param notes: what to know about it, each a sentence.
-    :param of_one_process: whether they are parts of one measurement and one command.
-    """
-
-    path: Path
-    experiments: tuple[Record, ...]
-    notes: tuple[str, ...] = ()
-    of_one_process: bool = False
-
-
-def read_experiments(
+def read(
     path: Path | str | Sequence[Path | str],
-    selection: Selection | None = None,
-    progress: Progress | None = None,
-) -> Recording:
-    """Return every experiment of a recording.
+    columns: Sequence[str] | None = None,
+    clock: str = CLOCKS[0],
+) -> dict[str, Signal]:
+    """Return columns of a recording as signals, by their names.
 
-    Topics that are named are used. Else the experiments that relay_node recorded are returned;
-    else an experiment of relay_node whose recording was cut short; else the one pair of topics
-    that looks like measurement and command.
-
-    :param path: a rosbag2 directory, an MCAP or ``.db3`` file, or a text with columns (``.csv``,
-        ``.txt``, ``.dat``, ``.tsv`` or ``.log``); or several of the first three that are one
-        timeline.
-    :param selection: what is wanted of it; default: everything.
-    :param progress: called with the progress of reading a bag.
-    :raises SelectionError: if the selection does not fit, or more than one pair does.
-    :raises BagError: if the recording cannot be read, or holds nothing to identify from.
+    :param path: a rosbag2 directory, an MCAP or ``.db3`` file, or a text with columns; or several
+        of the first three that are one timeline.
+    :param columns: names of topics, ``TOPIC:FIELD`` where a message holds several numbers, or of
+        the text's columns; default: every topic of one number, every column but the time.
+    :param clock: which time of a message counts, one of ``CLOCKS``; a text has but one.
+    :raises SelectionError: if there is no such column.
+    :raises BagError: if the recording cannot be read.
     """
     paths = [Path(path)] if isinstance(path, Path | str) else [Path(part) for part in path]
-    path, wanted = paths[0], selection or Selection()
-    if len(paths) > 1 and any(map(_is_text, paths)):
-        raise SelectionError("CSV files cannot be joined to one timeline; expected bags")
-    if _is_text(path):
-        if wanted.joint:
-            raise SelectionError(
-                f"--joint {wanted.joint} is for bags, whose messages name joints; of {path} name "
-                "two columns with --measurement and --command"
-            )
-        records, notes = _of_csv(path, wanted)
-    elif (wanted.time, wanted.time_unit, wanted.period) != (None, None, None):
-        raise SelectionError(
-            f"--time, --time-unit and --period are for CSV files, but {path} is not one"
-        )
-    else:
-        with ExitStack() as opened:
-            files: list[BagFile] = []
-            for file in (file for part in paths for file in _data_files(part)):
-                files.append(_opened(file, wanted.largest_chunk))
-                opened.enter_context(files[-1])
-            topics = Topics(path, files, wanted.clock, progress)
-            try:
-                records, notes = _of_topics(topics, wanted)
-            except BagError as error:
-                # The faults of the files may be the reason.
-                amiss = [note for note in topics.notes if note not in str(error)]
-                if not amiss:
-                    raise
-                raise type(error)("; ".join((str(error), *amiss))) from error
-    parts = tuple(window(record, wanted.start, wanted.end) for record in records)
-    # Those of relay_node may be of several loops, and tell of themselves how they ended.
-    of_one = all(record.outcome is Outcome.UNKNOWN for record in records)
-    return Recording(path, parts, tuple(notes), of_one)
+    if is_text(paths[0]):
+        # Imported here: it is not needed for a bag.
+        from relay_autotune.bag.csv_file import read_columns
+
+        return read_columns(paths[0], columns)
+    with opened(paths, clock) as topics:
+        return {name: timed.signal for name, timed in topics.signals(columns).items()}
+
+
+@contextmanager
+def opened(
+    paths: Sequence[Path],
+    clock: str = CLOCKS[0],
+    largest_chunk: int = LARGEST_CHUNK,
+    progress: Progress | None = None,
+) -> Iterator[Topics]:
+    """Give the topics of bags that are one timeline, with their files open.
+
+    :param paths: files, or folders of them.
+    :param clock: which time of a message counts, one of ``CLOCKS``.
+    :param largest_chunk: size of a chunk, or a message outside of chunks, beyond which it is left
+        out [bytes].
+    :param progress: called with the progress of reading.
+    :raises BagError: if one cannot be read; faults of the files that were found are said with it.
+    """
+    with ExitStack() as stack:
+        files = [
+            stack.enter_context(_opened(file, largest_chunk))
+            for part in paths
+            for file in _data_files(part)
+        ]
+        topics = Topics(paths[0], files, clock, progress)
+        try:
+            yield topics
+        except BagError as error:
+            # The faults of the files may be the reason.
+            amiss = [note for note in topics.notes if note not in str(error)]
+            if not amiss:
+                raise
+            raise type(error)("; ".join((str(error), *amiss))) from error
 
 
 def recordings_in(path: Path) -> list[Path]:
@@ -143,7 +118,8 @@ def may_be_recording(path: Path) -> bool:
         return True
 
 
-def _is_text(path: Path) -> bool:
+def is_text(path: Path) -> bool:
+    """Return whether a path is called like a text with columns."""
     return path.suffix.lower() in (".csv", ".txt", ".dat", ".tsv", ".log")
 
 
@@ -184,244 +160,3 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     # Split bags are numbered without leading zeros: bag_2 comes before bag_10.
     parts = re.split(r"(\d+)", path.name)
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
-
-
-def _of_topics(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]]:
-    if not topics.types():
-        raise BagError("; ".join((f"{topics.path} holds no topic", *topics.notes)))
-    if wanted.joint or wanted.measurement is not None or wanted.command is not None:
-        records, notes = _of_pair(topics, wanted)
-    else:
-        records, notes = recorded_experiments(topics)
-        if not records:
-            interrupted = interrupted_experiment(topics)
-            if interrupted is not None:
-                records = [interrupted]
-            else:
-                records, notes = _of_pair(topics, wanted)
-    return records, [*topics.notes, *notes]
-
-
-# Least number of samples of a record that is split into experiments.
-_FEWEST_SAMPLES = 12
-
-# Difference of two topics' lags to the recorder beyond which their clocks differ [ns].
-_CLOCK_DIFFERENCE_NS = 100_000_000
-
-
-def _of_pair(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]]:
-    """Return the experiments in two topics of any program, and notes about them."""
-    # Our own recordings need neither the search for a pair nor that for experiments.
-    from relay_autotune.bag.pairing import pair_of
-
-    names, notes = pair_of(topics, wanted)
-    measured, commanded = topics.signals(names).values()
-    notes = [*notes, *measured.notes, *commanded.notes]
-    signals = [measured.signal, commanded.signal]
-    difference = abs(measured.lag_ns - commanded.lag_ns)
-    if difference > _CLOCK_DIFFERENCE_NS:
-        # The publishers' clocks disagree: both are put on the recorder's.
-        signals = [
-            replace(timed.signal, time_ns=timed.signal.time_ns + timed.lag_ns)
-            for timed in (measured, commanded)
-        ]
-        notes.append(
-            f"the clocks behind {names[0]} and {names[1]} differ by {difference / 1e9:.3f} s; "
-            f"they are aligned by the recorder's clock"
-        )
-    record = join(signals[0], preceded(signals[1], wanted.command_before))
-    records, found = _taken_apart(record, whole=wanted.is_part)
-    return records, [*notes, *found]
-
-
-def _taken_apart(record: Record, *, whole: bool) -> tuple[list[Record], list[str]]:
-    """Return the experiments in a record of unknown origin, and notes about them.
-
-    :param record: the record.
-    :param whole: whether it is one experiment, whatever it looks like.
-    :raises BagError: if nothing stands out of the noise.
-    """
-    from relay_autotune.record.excitation import find_experiments
-
-    if whole or len(record) < _FEWEST_SAMPLES:
-        return [record], []
-    stretches = find_experiments(record)
-    if not stretches:
-        if np.ptp(record.measurement) == 0.0 or np.ptp(record.command) == 0.0:
-            # The identification then tells why nothing can be learned from it.
-            return [record], []
-        raise BagError(
-            "no relay phase, step, pulse or moving closed loop stands out of the noise: at rest "
-            "a controller's command only follows the noise of the measurement, which would give "
-            "a wrong model; record an experiment, or name a part to be used all the same with "
-            "--start and --end"
-        )
-    records = [record.part(stretch.first, stretch.last + 1) for stretch in stretches]
-    if len(stretches) == 1 and len(records[0]) == len(record):
-        return records, []
-    begins = record.time[[stretch.first for stretch in stretches]]
-    ends = record.time[[stretch.last for stretch in stretches]]
-    return records, [
-        f"experiment {number} of {len(records)}, {begin:g} s to {end:g} s: {stretch.reason}"
-        for number, (begin, end, stretch) in enumerate(
-            zip(begins, ends, stretches, strict=True), start=1
-        )
-    ]
-
-
-def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
-    from relay_autotune.bag.csv_file import read_csv
-
-    records: list[Record] = []
-    notes: list[str] = []
-    faults: list[BagError] = []
-    for log in read_csv(path, wanted):
-        notes += log.notes
-        try:
-            command = preceded(log.command, wanted.command_before)
-            record = join(log.measurement, command, dated=log.dated)
-            found, said = _taken_apart(record, whole=wanted.is_part)
-        except BagError as fault:
-            faults.append(fault)
-            continue
-        records += found
-        notes += said
-    if not records:
-        raise faults[0]
-    return records, [*notes, *(f"one of the recordings is left out: {f}" for f in faults)]
-
-
-def read_records(
-    path: Path | str,
-    *,
-    measurement: str | None = None,
-    command: str | None = None,
-    time: str | None = None,
-    start: float | None = None,
-    end: float | None = None,
-) -> tuple[Record, ...]:
-    """Return the experiments in a recording.
-
-    >>> from relay_autotune import read_records
-    >>> read_records("bags/heater.csv")
-    (<Record: 450 samples over 898 s, recorded elsewhere>,)
-    >>> (record,) = read_records("bags/step_test", measurement="/reactor/temperature",
-    ...                          command="/reactor/heater")
-
-    :param path: a rosbag2 directory, an MCAP file, or a CSV file with a header line.
-    :param measurement: topic or column of the measurement; None: found.
-    :param command: topic or column of the command; None: found.
-    :param time: column of the time [s] in a CSV file; None: the first.
-    :param start: beginning of the part to use [s from the first sample]; None: all.
-    :param end: end of the part to use [s from the first sample]; None: all.
-    :raises BagError: if it cannot be read, or the choice of topics or columns does not fit.
-    """
-    wanted = Selection(measurement, command, time, start, end)
-    return read_experiments(path, wanted).experiments
-
-
-_STAMP_ERROR_NS = 1000
-
-
-def recorded_experiments(topics: Topics) -> tuple[list[Record], list[str]]:
-    """Return the experiments whose record was published, each once, and notes about others.
-
-    They are recognised by the type of their messages, so that any recording of the topic will
-    do, under whatever name.
-
-    :param topics: the bag.
-    :raises BagError: if there are some, but none can be used.
-    """
-    records: dict[str, Record] = {}
-    refused: list[str] = []
-    for number, message in enumerate(topics.decoded(EXPERIMENT)):
-        key = str(message.experiment_id) or f"number {number}"
-        try:
-            records.setdefault(key, record_from_message(message))
-        except (RecordError, TypeError, ValueError, AttributeError) as error:
-            said = f"; it ended because: {message.reason}" if message.reason else ""
-            refused.append(f"experiment {key} in {topics.path} is of no use: {error}{said}")
-    if refused and not records:
-        raise BagError(refused[0])
-    return list(records.values()), refused
-
-
-def interrupted_experiment(topics: Topics) -> Record | None:
-    """Return the experiment that was being recorded when relay_node was killed.
-
-    :param topics: the bag; one that relay_node wrote says which topics are the loop's.
-    :return: None if the bag is not one of relay_node.
-    :raises BagError: if it ends before the first sample was answered.
-    """
-    for about in topics.metadata(EXPERIMENT_METADATA):
-        if {"measurement", "command", "experiment_id"} <= about.keys():
-            return _rebuilt(topics, about)
-    return None
-
-
-def _rebuilt(topics: Topics, about: Mapping[str, str]) -> Record:
-    names = (about["measurement"], about["command"])
-    found = topics.columns(names, FLOAT64)
-    if set(found) != set(names):
-        raise BagError(f"{topics.path} ends before the first sample of its experiment")
-    samples, answers = (found[name] for name in names)
-    # Here each sample is followed by its answer, before the next one; the last may be missing.
-    answer = np.searchsorted(answers.order, samples.order)
-    following = np.append(samples.order[1:], np.iinfo(np.int64).max)
-    answered = answer < len(answers)
-    answered[answered] = answers.order[answer[answered]] < following[answered]
-    if not bool(np.any(answered)):
-        raise BagError(f"{topics.path} ends before the first sample of its experiment")
-    answer = answer[answered]
-    taken = samples.publish_time[answered]
-    origin = int(taken[0])
-    cycles = _unbroken(topics.decoded(CYCLE))
-    try:
-        return Record(
-            time=(taken - origin) / 1e9,
-            measurement=samples.values[answered],
-            command=answers.values[answer],
-            receive_time=(samples.log_time[answered] - origin) / 1e9,
-            command_time=(answers.publish_time[answer] - origin) / 1e9,
-            settings=settings_from_message(cycles[-1].settings) if cycles else None,
-            cycle_start=_cycle_start(cycles, taken),
-            outcome=Outcome.ABORTED,
-            reason="the recording ends without the experiment's end "
-            f"(after {(taken[-1] - origin) / 1e9:.3f} s)",
-            experiment_id=about["experiment_id"],
-            start=start_seconds(origin),
-        )
-    except RecordError as error:
-        raise BagError(f"the samples in {topics.path} are of no use: {error}") from error
-
-
-def _unbroken(cycles: Sequence[Any]) -> list[Any]:
-    """Return the cycles without a gap in their numbers up to the newest, in order."""
-    by_index = {int(cycle.index): cycle for cycle in cycles}
-    run: list[Any] = []
-    index = max(by_index, default=-1)
-    while index in by_index:
-        run.insert(0, by_index[index])
-        index -= 1
-    return run
-
-
-def _cycle_start(cycles: Sequence[Any], taken: IntArray) -> tuple[int, ...]:
-    """Return the samples that bound the cycles.
-
-    :param cycles: their messages, in order and without a gap.
-    :param taken: time of each sample [ns], shape (n,).
-    """
-    bounds: list[int] = []
-    for cycle in cycles:
-        stamp = stamp_nanoseconds(cycle.header.stamp)
-        lead_in = min(int(cycle.lead_in), max(len(cycle.time) - 1, 0))
-        bounds += [stamp + round(float(t) * 1e9) for t in cycle.time[lead_in:][:1]]
-    bounds += [
-        stamp_nanoseconds(cycle.header.stamp) + round(float(cycle.time[-1]) * 1e9)
-        for cycle in cycles[-1:]
-        if len(cycle.time)
-    ]
-    # The stamps went through seconds in double precision.
-    near = np.searchsorted(taken, np.array(bounds, dtype=np.int64) - _STAMP_ERROR_NS)
-    return tuple(sorted({int(i) for i in near if i < taken.size}))

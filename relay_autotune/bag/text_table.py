@@ -24,10 +24,9 @@ from typing import BinaryIO, TextIO
 
 import numpy as np
 
-from relay_autotune.arrays import FloatArray, IntArray
+from relay_autotune.bag.arrays import FloatArray, IntArray
 from relay_autotune.bag.limits import LARGEST_TEXT, LONGEST_LINE
-from relay_autotune.errors import BagError
-from relay_autotune.text import visible
+from relay_autotune.errors import BagError, visible
 
 # Each is preferred to those after it where both make as many numbers: beside a semicolon, a tab
 # or a space a comma may be the decimal point.

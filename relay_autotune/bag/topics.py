@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from relay_autotune.arrays import FloatArray, IntArray
+from relay_autotune.bag.arrays import FloatArray, IntArray
 from relay_autotune.bag.bag_file import BagFile
 from relay_autotune.bag.cdr import Path, decode_messages, decoded_message
 from relay_autotune.bag.definitions import message_type
@@ -176,8 +176,12 @@ class Topics:
             for name, found in parts.items()
         }
 
-    def decoded(self, type_name: str) -> list[Any]:
-        """Return all messages of one of our types, in the order in which they were recorded."""
+    def decoded(self, type_name: str, defaults: Mapping[str, Any]) -> list[Any]:
+        """Return all messages of a type, in the order in which they were recorded.
+
+        :param type_name: such as ``std_msgs/msg/Float64``.
+        :param defaults: values of the fields that an older definition lacks, by their names.
+        """
         wanted = {
             (number, channel.id): channel
             for number, channel in self._channels()
@@ -185,7 +189,7 @@ class Topics:
         }
         found: list[tuple[int, Any]] = []
         for key, _, messages in self._messages(wanted):
-            decoded = decode_messages(wanted[key], messages.payloads())
+            decoded = decode_messages(wanted[key], messages.payloads(), defaults)
             found += zip(messages.log_time.tolist(), decoded, strict=True)
         return [message for _, message in sorted(found, key=lambda item: item[0])]
 

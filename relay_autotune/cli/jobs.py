@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING
 
 from relay_autotune.analysis import Task, analyse, analyse_jointly
 from relay_autotune.bag.limits import LARGEST_CHUNK
-from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.signals import CLOCKS, TIME_UNITS, Selection
 from relay_autotune.cli.arguments import (
     DEBUG,
@@ -41,6 +40,7 @@ from relay_autotune.loop.laws import LAWS
 from relay_autotune.parts import agreed
 from relay_autotune.quantities import declared
 from relay_autotune.record.record import Record
+from relay_autotune.recordings import read_experiments
 from relay_autotune.result import Analysis
 from relay_autotune.text import visible
 from relay_autotune.tuning.task import CONTROLLERS, DesignOptions

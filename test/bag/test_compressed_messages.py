@@ -31,10 +31,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from relay_autotune.bag.bag_file import McapFile
 from relay_autotune.bag.definitions import EXPERIMENT, Definition
-from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.topics import Topics
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
 from relay_autotune.errors import BagError
+from relay_autotune.recordings import read_experiments
 
 COUNT = 200
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.signals import Selection
 from relay_autotune.errors import BagError, SelectionError
+from relay_autotune.recordings import read_experiments
 
 
 def write(path, text):

@@ -10,9 +10,9 @@ import pytest
 import zstandard
 from made_bags import write_pair
 
-from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.signals import Selection
 from relay_autotune.errors import SelectionError
+from relay_autotune.recordings import read_experiments
 
 ALL = Selection("/measurement", "/command", start=0.0)
 

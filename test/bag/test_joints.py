@@ -12,9 +12,9 @@ import pytest
 from robot_bags import Robot, write_robot
 
 from relay_autotune.bag.pairing import plausible_pairs
-from relay_autotune.bag.reader import Recording, read_experiments
 from relay_autotune.bag.signals import Selection, Signal
 from relay_autotune.errors import SelectionError
+from relay_autotune.recordings import Recording, read_experiments
 
 JOINTS = ["left_wheel", "right_wheel", "arm"]
 STATES, ARRAY = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import shutil
 from types import SimpleNamespace
 
@@ -14,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_bags import (
+    REPOSITORY,
     START,
     assert_same_record,
     definition,
@@ -25,13 +27,13 @@ from made_bags import (
 )
 from mcap.writer import CompressionType, Writer
 
-from relay_autotune.bag.cdr import DEFAULTS
 from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, Definition
-from relay_autotune.bag.reader import read_experiments
+from relay_autotune.bag.reader import read
 from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.record.record import Outcome, Record
+from relay_autotune.recordings import DEFAULTS, read_experiments, read_records
 
 FACTS = {"experiment_id": "run-1", "measurement": "/measurement", "command": "/command"}
 LOOP = [Topic("/measurement"), Topic("/command")]
@@ -636,3 +638,28 @@ def test_a_window_without_samples_is_refused(tmp_path):
     write_many(tmp_path / "bag", {"/measurement": RAMP, "/command": SQUARE})
     with pytest.raises(SelectionError, match=r"no sample lies between --start 50 s.*9\.9 s long"):
         read_experiments(tmp_path / "bag", Selection(start=50.0))
+
+
+def test_one_function_reads_columns_of_a_bag_and_of_a_text():
+    folder, text = REPOSITORY / "bags" / "step_test", REPOSITORY / "bags" / "heater.csv"
+    y, u = "/reactor/temperature", "/reactor/heater"
+    (record,) = read_records(folder, measurement=y, command=u)
+    found = read(folder, [y], clock="publish")[y]
+    np.testing.assert_array_equal(found.values[-len(record) :], record.measurement)
+    assert set(read(folder)) == {y, u}
+    columns = read(text)
+    (log,) = read_records(text)
+    y, u = columns
+    np.testing.assert_allclose(columns[y].time_ns / 1e9, log.time + columns[y].time_ns[0] / 1e9)
+    np.testing.assert_array_equal(columns[y].values, log.measurement)
+    np.testing.assert_array_equal(read(text, [u])[u].values, columns[u].values)
+    with pytest.raises(SelectionError, match="has no column 'nothing'"):
+        read(text, ["nothing"])
+
+
+def test_the_readme_of_the_reader_runs(capsys, monkeypatch):
+    page = (REPOSITORY / "relay_autotune" / "bag" / "README.md").read_text()
+    monkeypatch.chdir(REPOSITORY)
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    exec(code, {})
+    assert capsys.readouterr().out.startswith("[")

@@ -14,11 +14,11 @@ import zstandard
 
 from relay_autotune.bag import bag_file
 from relay_autotune.bag.bag_file import SqliteFile
-from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.topics import Topics
 from relay_autotune.bag.writer import encode_float64
 from relay_autotune.errors import BagError, SelectionError
+from relay_autotune.recordings import read_experiments
 
 NAMES = Selection("/y", "/u")
 DEFINITION = "float64 data\n"

@@ -24,10 +24,10 @@ from relay_autotune.bag.bag_file import McapFile
 from relay_autotune.bag.definitions import message_type
 from relay_autotune.bag.field_path import numeric_paths
 from relay_autotune.bag.mcap_records import Channel
-from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.topics import Topics, named_field
 from relay_autotune.bag.writer import encode_float64
 from relay_autotune.errors import BagError, SelectionError
+from relay_autotune.recordings import read_experiments
 
 sys.path.insert(0, str(REPOSITORY / "benchmarks"))
 fuzz_framing = pytest.importorskip("fuzz_framing")

@@ -339,10 +339,10 @@ def test_whole_messages_of_any_type(text, seed, cut):
         bytes(store.serialize_cdr(m, "x_msgs/msg/T", little_endian=bool(rng.integers(0, 2))))
         for m in messages
     ]
-    ours = decode_messages(channel("x_msgs/msg/T", text), [*data, data[0] + bytes(7)])
+    ours = decode_messages(channel("x_msgs/msg/T", text), [*data, data[0] + bytes(7)], {})
     assert [plain(m) for m in ours] == [plain(m) for m in (*messages, messages[0])]
     with pytest.raises(BagError, match="of /t does not fit its definition"):
-        decode_messages(channel("x_msgs/msg/T", text), [data[0][:-cut]])
+        decode_messages(channel("x_msgs/msg/T", text), [data[0][:-cut]], {})
 
 
 def test_fields_of_the_installed_definitions():

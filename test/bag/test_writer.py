@@ -21,9 +21,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from relay_autotune.bag import writer as writer_module
 from relay_autotune.bag.definitions import Definition, find_definition
-from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.writer import BagWriter, Qos, Topic, encode_float64
 from relay_autotune.errors import BagError
+from relay_autotune.recordings import read_experiments
 
 FLOAT64 = "std_msgs/msg/Float64"
 

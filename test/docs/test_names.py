@@ -17,12 +17,12 @@ from analysed import analysed_once
 from pages import GUIDE, PAGES, ROOT, block_noted, blocks, commands, rows, spans
 from parameter_values import check_parameter_file, check_value
 
-from relay_autotune.bag.reader import read_experiments
 from relay_autotune.cli import apply_gains, csv_to_bag, replay, tune_loop
 from relay_autotune.exchange.document import document
 from relay_autotune.identification.methods import METHODS
 from relay_autotune.nodes.plant import MODES
 from relay_autotune.process.structures import STRUCTURES
+from relay_autotune.recordings import read_experiments
 from relay_autotune.tuning import RULES
 from tools.fill_docs import TABLES, filled
 

@@ -18,7 +18,7 @@ from typing import Any
 from analysed import analysed_once
 from tornado.websocket import websocket_connect
 
-from relay_autotune.bag.reader import read_experiments
+from relay_autotune.recordings import read_experiments
 from relay_autotune.report.case import case_of
 from relay_autotune.result import Analysis
 from relay_autotune.tuning import DesignOptions

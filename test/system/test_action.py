@@ -14,7 +14,7 @@ from loop_rig import RELIABLE, Rig
 from rclpy.action import ActionClient
 from std_msgs.msg import Float64
 
-from relay_autotune.bag.reader import read_experiments
+from relay_autotune.recordings import read_experiments
 from relay_autotune_msgs.action import Tune
 
 LOOP = {

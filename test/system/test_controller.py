@@ -23,8 +23,8 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 
-from relay_autotune.bag.reader import read_experiments
 from relay_autotune.process.transfer_function import TransferFunction as Process
+from relay_autotune.recordings import read_experiments
 from relay_autotune.text import digits
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction, Verification

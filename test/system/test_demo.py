@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from relay_autotune.bag.reader import read_experiments
+from relay_autotune.recordings import read_experiments
 
 
 def test_the_demo_tunes_and_leaves_bag_result_and_picture(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from loop_rig import RELIABLE, Process, Rig
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from relay_autotune.bag.reader import read_experiments
 from relay_autotune.record.record import Outcome
+from relay_autotune.recordings import read_experiments
 from relay_autotune_msgs.msg import PidGains, RelayExperiment
 
 BASELINE = 1.0

@@ -21,7 +21,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_domain import free_domain
 from std_msgs.msg import Float32, Float64
 
-from relay_autotune.bag.reader import read_experiments
+from relay_autotune.recordings import read_experiments
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
 
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)

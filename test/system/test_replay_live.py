@@ -19,12 +19,12 @@ from ros_domain import free_domain
 from std_msgs.msg import Float64
 
 from relay_autotune.analysis import analyse
-from relay_autotune.bag.reader import read_experiments
 from relay_autotune.bag.signals import Selection
 from relay_autotune.exchange.messages import fill_experiment
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.record.record import PiecewiseConstant, Record
+from relay_autotune.recordings import read_experiments
 from relay_autotune.result import Analysis
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
 from relay_autotune_msgs.srv import Identify

@@ -19,8 +19,8 @@ import pytest
 from loop_rig import RELIABLE, Rig
 from std_msgs.msg import Float64
 
-from relay_autotune.bag.reader import read_experiments
 from relay_autotune.record.record import Outcome
+from relay_autotune.recordings import read_experiments
 from relay_autotune_msgs.msg import RelayExperiment
 
 LOOP = {
