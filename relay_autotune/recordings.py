@@ -118,6 +118,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "noise_std": math.nan,
         "sought_width": 0.0,
         **dict.fromkeys(("experiment_id", "reason", "sought"), ""),
+        "why": {"code": 0, "names": (), "values": ()},
+        "notes": (),
         **dict.fromkeys(("outcome", "lost_samples"), 0),
         **dict.fromkeys(("time", "receive_time", "command_time"), ()),
         **dict.fromkeys(("measurement", "command", "cycle_start"), ()),

@@ -100,13 +100,12 @@ def fill_whys(message: Any, reason: Reason) -> None:
 def reason_from_message(message: Any, said: str = "", notes: Iterable[Any] = ()) -> Reason:
     """Read a `Reason` message.
 
-    :param message: the message; None, as a recording of before it was there has: a code that
-        says nothing.
+    :param message: the message; one of code 0, as an older recording has: it says nothing.
     :param said: the sentence that came with it.
     :param notes: further messages of this kind, that belong to it.
     """
     said = visible(said)
-    if message is None or int(message.code) == Code.NONE:
+    if int(message.code) == Code.NONE:
         return other(said)
     known = int(message.code) in set(Code)
     code = Code(int(message.code)) if known else Code.OTHER
@@ -200,9 +199,7 @@ def record_from_message(message: Any) -> Record:
         cycle_start=tuple(int(i) for i in message.cycle_start),
         outcome=outcome,
         reason=visible(str(message.reason)),
-        why=reason_from_message(
-            getattr(message, "why", None), message.reason, getattr(message, "notes", ())
-        ),
+        why=reason_from_message(message.why, message.reason, message.notes),
         experiment_id=visible(str(message.experiment_id)),
         start=start_seconds(stamp_nanoseconds(message.header.stamp)),
         lost_samples=int(message.lost_samples),
