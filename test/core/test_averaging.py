@@ -13,7 +13,7 @@ import pytest
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.identification.waveform.findings import point_stds
-from relay_autotune.identification.waveform.fit_covariance import Fit, Noise, estimate_of
+from relay_autotune.identification.waveform.fit_covariance import Fit, estimate_of
 from relay_autotune.identification.waveform.separable import evaluate, problem_of
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import FOPDT, SOPDT, SOPDT_ZERO, Structure
@@ -54,7 +54,7 @@ def _fit_of(structure: Structure, theta: np.ndarray, noise: float) -> Identifica
     error = noise * np.random.default_rng(4).standard_normal(run.time.size)
     problem = problem_of([(run.time, run.measurement + error, run.command)], structure)
     state = evaluate(problem, theta)
-    estimate = estimate_of(problem, state, Fit(problem, state, (), 1.0), Noise())
+    estimate = estimate_of(problem, state, Fit(problem, state, (), 1.0))
     assert estimate is not None
     return identified("waveform", estimate)
 

@@ -31,7 +31,6 @@ from relay_autotune.identification.waveform.candidates import support
 from relay_autotune.identification.waveform.determination import with_what_is_determined
 from relay_autotune.identification.waveform.fit_covariance import (
     Fit,
-    Noise,
     coarse_step,
     estimate_of,
     noise_inflation,
@@ -73,9 +72,9 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     rms = scale * math.sqrt(float(residual @ residual) / n)
     exact = rms <= scale * NEGLIGIBLE
     shares = support(fit.candidates)
-    allowed = posterior(fit, shares, noise_inflation(records, rms, fit), _frequency(fit))
-    noise = Noise(noise_inflation(records, rms, fit) * allowed.temper)
-    estimate = estimate_of(problem, state, fit, noise, bounded=True)
+    inflation = noise_inflation(records, rms, fit)
+    allowed = posterior(fit, shares, inflation, _frequency(fit))
+    estimate = estimate_of(problem, state, fit, inflation * allowed.temper)
     if estimate is None:
         raise IdentificationError(
             f"the fit of a {problem.structure.name} model left its structure; name another "

@@ -23,6 +23,8 @@ from relay_autotune.identification.waveform.residuals import (
 from relay_autotune.identification.waveform.separable import NEGLIGIBLE, Problem, Trial
 from relay_autotune.record.record import Record
 
+# Standard deviation of the prior of a dead time, over all times of the process together.
+_DEAD_TIME = 0.5
 _EPSILON = float(np.finfo(float).eps)
 
 
@@ -47,16 +49,6 @@ class Fit:
     base: FloatArray | None = None
     loss: str = "squares"
     warnings: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Properties of the residual.
-
-    :param inflation: ratio of the covariance to that of white noise of the same size.
-    """
-
-    inflation: float = 1.0
 
 
 def raw_residual(problem: Problem, state: Trial) -> FloatArray:
@@ -95,16 +87,17 @@ def noise_inflation(records: Sequence[Record], rms: float, fit: Fit) -> float:
 
 
 def estimate_of(
-    problem: Problem, state: Trial, fit: Fit, noise: Noise, *, bounded: bool = False
+    problem: Problem, state: Trial, fit: Fit, inflation: float = 1.0
 ) -> Estimate | None:
     """Return the structure's parameters with their covariance to first order.
+
+    A dead time is known to half of all times of the process together: without samples before the
+    response, gain and dead time cannot be told apart at all.
 
     :param problem: what was fitted.
     :param state: its fit.
     :param fit: for its scale and loss.
-    :param noise: properties of the residual.
-    :param bounded: True: a dead time is known to half of all times of the process together.
-        Without samples before the response, gain and dead time cannot be told apart at all.
+    :param inflation: ratio of the covariance to that of white noise of the residual's size.
     :return: None if the fit left its structure.
     """
     read = problem.structure.read(state.theta, fit.scale * state.coefficients)
@@ -112,11 +105,11 @@ def estimate_of(
         return None
     gradient = _gradient(problem, state, fit.scale)
     with np.errstate(over="ignore", invalid="ignore"):
-        root = gradient @ _root(problem, state, fit, noise, bounded)
+        root = gradient @ _root(problem, state, fit, inflation)
     return Estimate.of_root(*read, root)
 
 
-def _root(problem: Problem, state: Trial, fit: Fit, noise: Noise, bounded: bool) -> FloatArray:
+def _root(problem: Problem, state: Trial, fit: Fit, inflation: float) -> FloatArray:
     """Return B of the covariance B B' of all linear coefficients and theta, in this order.
 
     For least squares that is ``s^2 (J'J)^-1``. For a robust loss r is the loss's derivative, over
@@ -125,11 +118,10 @@ def _root(problem: Problem, state: Trial, fit: Fit, noise: Noise, bounded: bool)
     """
     n = state.residual.size
     jacobian, scores, slope = _scores(problem, state, fit)
-    if bounded:
-        slow = unit_steps(problem.structure, state.theta)[-1]
-        prior = np.zeros((jacobian.shape[0], 1))
-        prior[-1] = math.sqrt(float(scores @ scores) / n) / (0.5 * slow)
-        jacobian, scores = np.append(jacobian, prior, axis=1), np.append(scores, 0.0)
+    slow = unit_steps(problem.structure, state.theta)[-1]
+    prior = np.zeros((jacobian.shape[0], 1))
+    prior[-1] = math.sqrt(float(scores @ scores) / n) / (_DEAD_TIME * slow)
+    jacobian, scores = np.append(jacobian, prior, axis=1), np.append(scores, 0.0)
     size = np.sqrt(np.einsum("pn,pn->p", jacobian, jacobian))
     size[size == 0.0] = 1.0
     r = np.linalg.qr((jacobian / size[:, None]).T, mode="r")
@@ -138,7 +130,7 @@ def _root(problem: Problem, state: Trial, fit: Fit, noise: Noise, bounded: bool)
     singular = np.maximum(singular, _EPSILON * n * singular[0])
     inverse = (right.T / singular) @ left.T / size[:, None]
     degrees = max(n - state.parameters, 1)
-    variance = float(scores @ scores) / degrees * noise.inflation
+    variance = float(scores @ scores) / degrees * inflation
     return np.asarray(inverse * math.sqrt(variance) / slope)
 
 

@@ -153,61 +153,52 @@ class Problem:
             last.
         """
         parts = self.experiments
-        if len(parts) == 1:
-            common, by_theta, own, own_by_theta, rest = self._of_one(theta, parts[0], 0)
-            columns = np.concatenate((common, own, rest))
-            if own.shape[0]:
-                by_theta = np.concatenate((by_theta, own_by_theta), axis=1)
-            return columns, by_theta
         found = [self._of_one(theta, part, i) for i, part in enumerate(parts)]
-        own_rows = sum(f[2].shape[0] for f in found)
-        rest_rows = sum(f[4].shape[0] for f in found)
-        k, n = found[0][0].shape[0], self.time.size
-        columns = np.zeros((k + own_rows + rest_rows, n))
-        derivatives = np.zeros((theta.size, k + own_rows, n))
-        first, last = k, k + own_rows
-        for part, (common, by_theta, own, own_by_theta, rest) in zip(parts, found, strict=True):
-            columns[:k, part], derivatives[:, :k, part] = common, by_theta
-            place = slice(first, first + own.shape[0])
-            columns[place, part], derivatives[:, place, part] = own, own_by_theta
-            columns[last : last + rest.shape[0], part] = rest
+        if len(parts) == 1:
+            (columns, by_theta, rest) = found[0]
+            return np.concatenate((columns, rest)), by_theta
+        k, n = len(self.structure.powers), self.time.size
+        own_rows = sum(columns.shape[0] - k for columns, _, _ in found)
+        last = k + own_rows
+        every = np.zeros((last + sum(rest.shape[0] for _, _, rest in found), n))
+        derivatives = np.zeros((theta.size, last, n))
+        first = k
+        for part, (columns, by_theta, rest) in zip(parts, found, strict=True):
+            # The responses are common to all experiments, the other columns their own.
+            every[:k, part], derivatives[:, :k, part] = columns[:k], by_theta[:, :k]
+            place = slice(first, first + columns.shape[0] - k)
+            every[place, part], derivatives[:, place, part] = columns[k:], by_theta[:, k:]
+            every[last : last + rest.shape[0], part] = rest
             first, last = place.stop, last + rest.shape[0]
-        return columns, derivatives
+        return every, derivatives
 
     def _of_one(
         self, theta: FloatArray, part: slice, number: int
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return one experiment's responses, free motion and straight line, with derivatives."""
-        time = self.time[part]
-        common, by_theta = columns_of(self.structure, theta, time, self.inputs[number])
-        own: FloatArray = np.zeros((0, time.size))
-        own_by_theta: FloatArray = np.zeros((theta.size, 0, time.size))
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return one experiment's columns with their derivatives, and its straight line."""
+        time, u = self.time[part], self.inputs[number]
+        blocks = [columns_of(self.structure, theta, time, u)]
         if self.relaxation or self.structure.unstable:
-            own, own_by_theta = free_motion(
-                self.structure.denominator, theta, time, growing_only=not self.relaxation
+            growing_only = not self.relaxation
+            blocks.append(
+                free_motion(self.structure.denominator, theta, time, growing_only=growing_only)
             )
+        further = []
         if self.past:
             # The level before is that of a step at the first sample, with the same response.
-            step = PiecewiseConstant(time[:1], np.ones(1), 0.0)
-            before, before_by_theta = columns_of(self.structure, theta, time, step)
-            own = np.concatenate((own, before))
-            own_by_theta = np.concatenate((own_by_theta, before_by_theta), axis=1)
+            further.append(_pulse(float(time[0]), math.inf))
         if self.unequal:
-            folded, folded_by_theta = columns_of(
-                self.structure, theta, time, _folded(self.inputs[number])
-            )
-            own = np.concatenate((own, folded))
-            own_by_theta = np.concatenate((own_by_theta, folded_by_theta), axis=1)
+            further.append(_folded(u))
         if self.load is not None:
-            for pulse in (math.inf, self.shortest):
-                step = _pulse(self.load, pulse)
-                felt, felt_by_theta = columns_of(self.structure, theta, time, step)
-                own = np.concatenate((own, felt))
-                own_by_theta = np.concatenate((own_by_theta, felt_by_theta), axis=1)
+            further += [_pulse(self.load, length) for length in (math.inf, self.shortest)]
+        blocks += [columns_of(self.structure, theta, time, step) for step in further]
         rest = np.ones((1 + self.drift, time.size))
         if self.drift:
             rest[1] = (time - time.mean()) / np.ptp(time)
-        return common, by_theta, own, own_by_theta, rest
+        if len(blocks) == 1:
+            return *blocks[0], rest
+        columns = np.concatenate([b[0] for b in blocks])
+        return columns, np.concatenate([b[1] for b in blocks], axis=1), rest
 
     def seen(self, rows: FloatArray) -> FloatArray:
         """Return rows multiplied by the samples' weights, and whitened by the noise's colour.
