@@ -4,16 +4,17 @@
 """Models that a record allows: draws from one posterior over all candidates, and of each half.
 
 A candidate's posterior is that of its samples under the noise that was found, with a wide prior
-about its estimate: each time is known to a factor of e, a dead time to all times together. So a
-direction of which the samples tell nothing has draws around the estimate, not of any size. It is
-approximated by Laplace's method (Gauss-Newton steps, then a normal distribution); a draw whose sum
-of squares the data exclude is drawn again, so that none goes beyond what the profile allows.
+about its estimate: gain and each time are known to a factor of e, dead time and zero to all times
+together. So a direction of which the samples tell nothing has draws around the estimate, not of
+any size. It is approximated by Laplace's method (Gauss-Newton steps, then a normal distribution).
+A draw that the samples make less likely than that is drawn again by the ratio of the two.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,10 +39,14 @@ from relay_autotune.process.transfer_function import TransferFunction
 
 # Samples at which draws are compared with the fit, and those of both halves together.
 _MOST_SAMPLES, _MOST_OF_HALVES = 600, 2400
+# Least number of samples in a half that is asked for models of its own.
 _FEWEST = 24
+# Gauss-Newton steps to the most likely point, halvings of each, and the relative gain that ends
+# them: the draws need it to a small part of a standard deviation.
 _STEPS, _HALVINGS, _SETTLED = 10, 4, 1e-3
 # Standard deviation of the prior of a logarithm; that of a dead time or a zero is all times.
 _LOGARITHM = 1.0
+# Draws of the mixture, whose share of bad ones is known to 5 %, and of each half.
 DRAWS = 100
 _DRAWS_OF_HALF = 40
 # Farthest point of the search in standard deviations of the prior.
@@ -273,6 +278,90 @@ class _Point:
         return float(self.left @ self.left) / variance + self.far
 
 
+@dataclass(frozen=True)
+class _Density:
+    """Likelihood of some samples times the prior about an estimate.
+
+    :param problem: the samples.
+    :param centre: of the prior, as a point.
+    :param deviation: standard deviations of the prior, shape (p,).
+    :param noise: variance of the noise that a residual shows.
+    """
+
+    problem: Problem
+    centre: FloatArray
+    deviation: FloatArray
+    noise: Callable[[FloatArray], float]
+
+    def coefficients(self, point: _Point) -> FloatArray:
+        """Return the numerator's coefficients at a point."""
+        size = point.sign * math.exp(point.at[0])
+        return size * np.append(1.0, point.at[1 : len(self.problem.structure.powers)])
+
+    def theta(self, point: _Point) -> FloatArray:
+        """Return theta at a point."""
+        return point.at[len(self.problem.structure.powers) :]
+
+    def about(self, at: FloatArray, sign: float) -> _Point:
+        """Return the point next to some place within the bounds of the search."""
+        reach = _FARTHEST * self.deviation
+        at = np.clip(at, self.centre - reach, self.centre + reach)
+        at[-1] = max(float(at[-1]), 0.0)
+        far = float(np.sum(((at - self.centre) / self.deviation) ** 2))
+        point = _Point(at, sign, np.empty(0), np.empty((0, 0)), 1.0, far)
+        gain = self.coefficients(point)
+        left, slopes = _linearised(self.problem, gain, self.theta(point))
+        by_log = gain @ slopes[: gain.size]
+        slopes[1 : gain.size] *= gain[0]
+        slopes[0] = by_log
+        variance = max(self.noise(left), NEGLIGIBLE**2)
+        return replace(point, left=left, jacobian=slopes, variance=variance)
+
+    def axes_at(self, point: _Point) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return singular values of the slopes in units of prior and noise, and their axes."""
+        scaled = point.jacobian * (self.deviation / math.sqrt(point.variance))[:, None]
+        axes, values, rows = np.linalg.svd(scaled, full_matrices=False)
+        return axes, values, rows
+
+    def most_likely(self, here: _Point) -> _Point:
+        """Return the most likely point near another one, by steps of Gauss and Newton."""
+        for _ in range(_STEPS):
+            axes, values, rows = self.axes_at(here)
+            along = values * (rows @ here.left) / math.sqrt(here.variance)
+            along = along - axes.T @ ((here.at - self.centre) / self.deviation)
+            step = self.deviation * (axes @ (along / (1.0 + values**2)))
+            cost = here.cost(here.variance)
+            for _ in range(_HALVINGS):
+                trial = self.about(here.at + step, here.sign)
+                now = trial.cost(here.variance)
+                if now < cost:
+                    break
+                step = 0.5 * step
+            else:
+                break
+            here = trial
+            if cost - now < _SETTLED * here.cost(here.variance):
+                break
+        return here
+
+    def draws(self, here: _Point, count: int, rng: np.random.Generator) -> Iterator[_Point | None]:
+        """Yield points by Laplace's approximation; None: the density is less than it says."""
+        axes, values, _ = self.axes_at(here)
+        # The symmetric root, which turns on no sign or order of the axes.
+        root = (axes / np.sqrt(1.0 + values**2)) @ axes.T
+        least = here.cost(here.variance)
+        while True:
+            for normal in _normal(count, here.at.size, rng)[:count]:
+                point = self.about(here.at + self.deviation * (root @ normal), here.sign)
+                # Density over that of the normal distribution about the most likely point.
+                rise = point.cost(here.variance) - least - float(normal @ normal)
+                yield point if math.log(1.0 - rng.random()) <= -0.5 * rise else None
+
+
+def _point_of(gain: FloatArray, theta: FloatArray) -> FloatArray:
+    return np.concatenate(([math.log(abs(gain[0]))], gain[1:] / gain[0], theta))
+
+
 def _allowed(
     problem: Problem,
     gain: FloatArray,
@@ -294,89 +383,39 @@ def _allowed(
     """
     structure, k = problem.structure, gain.size
     slow = float(unit_steps(structure, theta)[-1])
-    deviation = np.array([_LOGARITHM, *[slow] * (k - 1), *[_LOGARITHM] * (theta.size - 1), slow])
-    none = _Drawn((), np.empty((0, 0)))
     if not (slow > 0.0 and gain[0] != 0.0):
-        return none
-
-    def unpacked(at: FloatArray, sign: float) -> tuple[FloatArray, FloatArray]:
-        return sign * math.exp(at[0]) * np.append(1.0, at[1:k]), at[k:]
-
-    def packed(gain: FloatArray, theta: FloatArray) -> FloatArray:
-        return np.concatenate(([math.log(abs(gain[0]))], gain[1:] / gain[0], theta))
-
-    known = _within_the_record(structure, packed(gain, theta), float(np.ptp(problem.time)))
-
-    def about(at: FloatArray, sign: float) -> _Point:
-        at = np.clip(at, -_FARTHEST * deviation + known, _FARTHEST * deviation + known)
-        at[-1] = max(float(at[-1]), 0.0)
-        coefficients, own = unpacked(at, sign)
-        left, slopes = _linearised(problem, coefficients, own)
-        by_log = coefficients @ slopes[:k]
-        slopes[1:k] *= coefficients[0]
-        slopes[0] = by_log
-        far = float(np.sum(((at - known) / deviation) ** 2))
-        return _Point(at, sign, left, slopes, max(noise(left), NEGLIGIBLE**2), far)
-
-    def axes_at(point: _Point) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return singular values of the slopes in units of prior and noise, and their axes."""
-        scaled = point.jacobian * (deviation / math.sqrt(point.variance))[:, None]
-        axes, values, rows = np.linalg.svd(scaled, full_matrices=False)
-        return axes, values, rows
-
-    here = start = about(known, math.copysign(1.0, gain[0]))
+        return _Drawn((), np.empty((0, 0)))
+    deviation = np.array([_LOGARITHM, *[slow] * (k - 1), *[_LOGARITHM] * (theta.size - 1), slow])
+    length = float(np.ptp(problem.time))
+    centre = _within_the_record(structure, _point_of(gain, theta), length)
+    density = _Density(problem, centre, deviation, noise)
+    here = start = density.about(centre, math.copysign(1.0, gain[0]))
     # The best fit without the prior may be nearer, but also run off where samples tell little.
     own = refine(problem, theta, tolerance=TRIAL, most=_STEPS)
     if own.coefficients[0] != 0.0:
-        at = packed(own.coefficients[:k], own.theta)
-        elsewhere = about(at, math.copysign(1.0, own.coefficients[0]))
+        at = _point_of(own.coefficients[:k], own.theta)
+        elsewhere = density.about(at, math.copysign(1.0, own.coefficients[0]))
         here = min(here, elsewhere, key=lambda p: p.cost(start.variance))
-    for _ in range(_STEPS):
-        axes, values, rows = axes_at(here)
-        along = values * (rows @ here.left) / math.sqrt(here.variance)
-        along = along - axes.T @ ((here.at - known) / deviation)
-        step = deviation * (axes @ (along / (1.0 + values**2)))
-        cost = here.cost(here.variance)
-        for _ in range(_HALVINGS):
-            trial = about(here.at + step, here.sign)
-            now = trial.cost(here.variance)
-            if now < cost:
-                break
-            step = 0.5 * step
-        else:
-            break
-        here = trial
-        if cost - now < _SETTLED * here.cost(here.variance):
-            break
-    axes, values, _ = axes_at(here)
-    # The symmetric root, which turns on no sign or order of the axes.
-    root = (axes / np.sqrt(1.0 + values**2)) @ axes.T
-    least = here.cost(here.variance)
+    here = density.most_likely(here)
     models: list[TransferFunction] = []
-    drawn: list[FloatArray] = []
-    for number in range(_TRIES * count):
+    values: list[FloatArray] = []
+    for point in itertools.islice(density.draws(here, count, rng), _TRIES * count):
         if len(models) == count:
             break
-        if number % count == 0:
-            batch = _normal(count, known.size, rng)
-        normal = batch[number % count]
-        point = about(here.at + deviation * (root @ normal), here.sign)
-        # Density of the posterior over that of the normal distribution about its best point.
-        rise = point.cost(here.variance) - least - float(normal @ normal)
-        if math.log(1.0 - rng.random()) > -0.5 * rise:
+        if point is None:
             continue
-        coefficients, own_theta = unpacked(point.at, point.sign)
+        at, coefficients = density.theta(point), scale * density.coefficients(point)
         try:
-            model = structure.model_at(own_theta, scale * coefficients)
-            read = structure.read(own_theta, scale * coefficients, like=theta)
+            model = structure.model_at(at, coefficients)
+            read = structure.read(at, coefficients, like=theta)
         except ModelError:
             continue
         if model is not None and read is not None:
             models.append(model)
-            drawn.append(read[1])
-    rise = start.cost(here.variance) - least
-    excluded = rise > 2.0 * float(gammaincinv(0.5 * known.size, 1.0 - _EXCLUDED))
-    return _Drawn(tuple(models), np.array(drawn), excluded)
+            values.append(read[1])
+    rise = start.cost(here.variance) - here.cost(here.variance)
+    excluded = rise > 2.0 * float(gammaincinv(0.5 * centre.size, 1.0 - _EXCLUDED))
+    return _Drawn(tuple(models), np.array(values), excluded)
 
 
 def _within_the_record(structure: Structure, at: FloatArray, length: float) -> FloatArray:
