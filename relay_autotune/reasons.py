@@ -713,43 +713,41 @@ class Code(enum.IntEnum):
         "The numbers say what differs; the gains of before are back: tune again at this operating "
         "point.",
     )
-    VERIFYING = _Row(503, "a verification is running", "", "One runs at a time.", "", True)
+    VERIFYING = _Row(503, "a verification is running", meaning="One runs at a time.")
     NONE_WAIT = _Row(
-        504, "no gains wait[; {refused}]", "", "No tune has given gains yet.", "", True
+        504,
+        "no gains wait to be applied[; {refused}]",
+        meaning="No tune has given gains yet, or they were refused.",
+        transient=True,
     )
     GAINS_AT_WORK = _Row(
         505,
-        "gains are being put in force or brought back",
-        "try again",
-        "One change of gains at a time.",
+        "gains are being put in force; wait for the end of that",
+        meaning="One change of gains at a time.",
         transient=True,
     )
     BRINGING_BACK = _Row(
         506,
-        "gains of before are being brought back{open}",
-        "",
-        "The node of apply_to does not take them yet.",
+        "gains of before are being brought back[{open}]",
+        meaning="The node of apply_to does not take them yet.",
         transient=True,
     )
     NODE_NOT_THERE = _Row(
         507,
-        "the node {node} is not there, or has no parameter services",
-        "",
-        "Another name or namespace, or it is not running.",
+        "the node {node} is not there, or has no parameter services[{open}]",
+        meaning="Another name or namespace, or it is not running.",
         transient=True,
     )
     FEW_SAMPLES = _Row(
         508,
         "only {samples} samples have come with a command, expected {needed}",
-        "",
-        "The loop has just begun to run.",
+        meaning="The loop has just begun to run.",
         transient=True,
     )
     NOBODY_SUBSCRIBES = _Row(
         509,
-        "nobody subscribes to {topic}",
-        "",
-        "The actuator is not connected to controller_node.",
+        "nobody subscribes to {topic}[ {since}]",
+        meaning="The actuator is not connected to controller_node.",
         transient=True,
     )
     NOBODY_TAKES = _Row(
@@ -762,9 +760,85 @@ class Code(enum.IntEnum):
     NOT_HEARD = _Row(
         511,
         "no command of {node} has been heard",
-        "",
-        "The other controller's commands are not connected.",
+        meaning="The other controller's commands are not connected.",
         transient=True,
+    )
+    SILENT_OWNER = _Row(
+        530,
+        "no command of {node} for {silence:.3g} s",
+        meaning="The other controller has stopped.",
+    )
+    OTHER_EXPERIMENT = _Row(
+        512,
+        "the gains are of the experiment {experiment}, and its model has not come; the newest one "
+        "is of {newest}",
+        "try again when the model has come, or run a tune",
+        "A step is predicted by the model of the same experiment.",
+    )
+    DOUBTFUL_MODEL = _Row(
+        513,
+        "the model that would predict the step is {doubt}",
+        "set the parameter accept_doubtful to true to step all the same",
+        "A doubtful model predicts no step.",
+        "accept_doubtful true",
+    )
+    BAD_STEP = _Row(
+        514, "{sentence}", meaning="The step is not given, too large, or not possible."
+    )
+    NOT_AUTOMATIC = _Row(
+        515,
+        "the controller is not in automatic, or has no gains",
+        meaning="Nothing closes the loop.",
+    )
+    TUNING = _Row(
+        516, "a tune is running", meaning="A tune and a verification exclude each other."
+    )
+    NOT_AT_REST = _Row(
+        520,
+        "the loop is not at rest: the measurement moved by {drift:.3g} over the last {samples} "
+        "samples",
+        "wait until it has settled",
+        "A step is seen on a loop at rest alone.",
+    )
+    STEP_SILENT = _Row(
+        521, "no measurement for {silence:.3g} s", meaning="The sensor has fallen silent."
+    )
+    STEP_TIME_STANDS = _Row(
+        522,
+        "the time of the samples stands still: is /clock published?",
+        meaning="A simulation is paused, or the clock is stuck.",
+    )
+    STEP_TIME_BACKWARDS = _Row(
+        523, "time went backwards, by {by:.3g} s", meaning="A clock was set back."
+    )
+    STEP_GAP = _Row(
+        524,
+        "the samples' time went on by {by:.3g} s from one to the next",
+        meaning="Samples are missing, or a clock was set forward.",
+    )
+    STEP_OVERTIME = _Row(
+        525,
+        "the verification took far longer than planned on the steady clock",
+        meaning="The time of the samples runs far too slowly.",
+    )
+    STEP_RAN_AWAY = _Row(
+        526,
+        "the measurement went {away:.3g} away from where it was, more than {most:.3g}: three "
+        "times what was predicted",
+        meaning="The loop does not do what the model predicts.",
+    )
+    STEP_OUT_OF_RANGE = _Row(
+        527,
+        "the measurement left its range, to {value:.6g}",
+        meaning="The measurement went beyond measurement_min to measurement_max.",
+    )
+    NOT_JUDGED = _Row(
+        528,
+        "the step could not be judged: {why}",
+        meaning="The sensor is too coarse for the step.",
+    )
+    INTERFERED = _Row(
+        529, "{sentence}", meaning="Somebody else has changed the loop during the step."
     )
 
     # Defects.
@@ -796,6 +870,22 @@ def other(sentence: str) -> Reason:
 
 NONE = Reason(Code.NONE)
 """Nothing has happened."""
+
+
+def may_pass(sentence: str) -> bool:
+    """Tell whether a sentence holds a reason that may go away by itself.
+
+    For services whose answer is a sentence alone, such as std_srvs/Trigger: what is looked for are
+    the table's own words.
+
+    :param sentence: of another node.
+    """
+    patterns = (
+        re.sub(r"\\{.*?\\}", ".*", re.escape(_OPTIONAL.sub("", code.row.found)))
+        for code in Code
+        if code.row.transient
+    )
+    return any(re.search(pattern, sentence) for pattern in patterns)
 
 
 def joined(reasons: Sequence[Reason]) -> Reason:

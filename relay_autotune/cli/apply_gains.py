@@ -37,6 +37,8 @@ from relay_autotune.cli.terminal import (
     write,
 )
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, TuningError
+from relay_autotune.exchange.messages import reason_from_message
+from relay_autotune.reasons import Code
 from relay_autotune.text import digits, duration
 
 if TYPE_CHECKING:
@@ -316,14 +318,15 @@ def found_entries(result: Any, noise_std: float = math.nan) -> list[tuple[str, s
     :param result: the `Verify.Result`.
     :param noise_std: of the measurement [y]; NaN: not known.
     """
-    from relay_autotune.control.verification import NARROWLY, NOISE_ALLOWANCE
+    from relay_autotune.control.verification import NOISE_ALLOWANCE
 
     told = f"failed: {result.reason}"
     if result.passed:
         told = "passed: the loop does what the model predicts"
-    reasons = [step.reason.partition("; ")[0] for step in result.steps]
-    if narrow := [r.removeprefix(NARROWLY) for r in reasons if r.startswith(NARROWLY)]:
-        told = f"passed, {NARROWLY}{'; '.join(narrow)}" if result.passed else told
+    whys = [reason_from_message(step.why) for step in result.steps]
+    narrow = [str(why["narrow"]) for why in whys if why.code is Code.NARROWLY]
+    if narrow and result.passed:
+        told = f"passed, narrowly: {'; '.join(narrow)}"
     found = [("verdict", told)]
     for step in result.steps:
         setpoint = step.kind == step.SETPOINT

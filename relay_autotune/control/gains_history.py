@@ -22,12 +22,12 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from relay_autotune.errors import TuningError
+from relay_autotune.reasons import Code
 
 # Number of earlier sets, and of failed and of doubtful sets, that are kept.
 KEPT = 20
 KNOWN = 1000
 # Why no change of the gains may begin now.
-AT_WORK = "gains are being put in force; wait for the end of that"
 # Numbers with a smaller relative difference are equal.
 _EQUAL = 1e-9
 
@@ -309,7 +309,7 @@ class GainsHistory:
         if self.work is Work.VERIFY:
             raise HistoryError("a verification is running; wait for its end")
         if self.work is Work.APPLY:
-            raise HistoryError(AT_WORK)
+            raise HistoryError(Code.GAINS_AT_WORK())
 
     def _with(self, entry: Entry | None) -> GainsHistory:
         """Put new gains in force, and keep the present ones if they are a whole set."""

@@ -21,6 +21,7 @@ from relay_autotune.loop.laws import LawRate
 from relay_autotune.loop.sampled import UNLIMITED, Limits
 from relay_autotune.loop.sampled_loop import SampledLoop
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.reasons import Code, Reason
 from relay_autotune.record.record import Record
 
 # A response has settled when it stays within this part of its largest deviation.
@@ -43,7 +44,6 @@ RUNAWAY = 3.0
 
 # A comparison that takes more than this part of its tolerance passes narrowly.
 _NARROW = 0.75
-NARROWLY = "narrowly: "
 
 # The step that proves most: multiples of the tune's swing and of the noise, whichever is larger;
 # and the multiple at which the noise does not decide the overshoot, if it takes but a part of the
@@ -151,7 +151,7 @@ class Comparison:
     """Comparison of a measured step with the predicted one.
 
     :param passed: True if every comparison is within its tolerance.
-    :param reason: the problems, and the compared numbers.
+    :param why: the problems, or what passes narrowly, and the compared numbers.
     :param measured: the measured response.
     :param expected: the predicted one.
     :param predicted: predicted deviation at each sample [y], shape (n,).
@@ -162,7 +162,7 @@ class Comparison:
     """
 
     passed: bool
-    reason: str
+    why: Reason
     measured: Response
     expected: Response
     predicted: FloatArray
@@ -170,6 +170,11 @@ class Comparison:
     gain_ratio: float
     ms: float
     ms_predicted: float
+
+    @property
+    def reason(self) -> str:
+        """The same as a sentence."""
+        return str(self.why)
 
 
 @dataclass(frozen=True)
@@ -535,19 +540,22 @@ def compare(
     ms, ms_predicted = _ms(gains, scaled(model, ratio), rate), _ms(gains, model, rate)
     compared = _comparisons(measured, expected, ratio, ms, ms_predicted, time)
     # Written so that NaN does not pass.
-    told = problems = [c.problem for c in compared if not c.taken <= 1.0]
+    problems = [c.problem for c in compared if not c.taken <= 1.0]
     narrow = [c.numbers for c in compared if c.taken > _NARROW]
-    if narrow and not problems:
-        told = [NARROWLY + ", ".join(narrow)]
     numbers = (
         f"overshoot {measured.overshoot:.0%} (predicted {expected.overshoot:.0%}), "
         f"settling {measured.settling_time:.3g} s ({expected.settling_time:.3g} s), "
         f"IAE {measured.iae:.3g} ({expected.iae:.3g}), Ms {ms:.2f} ({ms_predicted:.2f}), "
         f"gain {ratio:.2f} times the model's"
     )
+    why = Code.AS_PREDICTED(numbers=numbers)
+    if problems:
+        why = Code.NOT_AS_PREDICTED(problems="; ".join(problems), numbers=numbers)
+    elif narrow:
+        why = Code.NARROWLY(narrow=", ".join(narrow), numbers=numbers)
     return Comparison(
         passed=not problems,
-        reason="; ".join((*told, numbers)),
+        why=why,
         measured=measured,
         expected=expected,
         predicted=predicted,

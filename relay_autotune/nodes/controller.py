@@ -50,7 +50,7 @@ from relay_autotune.nodes.parameters import ask_before_changes, declare, merged,
 from relay_autotune.nodes.results import ResultCheck, why_doubtful
 from relay_autotune.nodes.verifier import Predictors, Verifiable, Verifier
 from relay_autotune.nodes.watch import Following, Repeater, require_own_time
-from relay_autotune.reasons import Reason
+from relay_autotune.reasons import Code, Reason
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage
@@ -251,7 +251,7 @@ class ControllerNode(ServedNode):
             self._untaken = untaken
             topic, held = self._commands.topic_name, self._pid.command
             if untaken:
-                self._verifier.interrupt(f"nobody subscribes to {topic} any more")
+                self._verifier.interrupt(Code.NOBODY_SUBSCRIBES(topic=topic, since="any more"))
                 self.get_logger().warning(
                     f"nobody subscribes to {topic}: the command is held at {held:g} until "
                     f"somebody does"
@@ -273,7 +273,8 @@ class ControllerNode(ServedNode):
             )
             return
         if value != self._setpoint:
-            self._verifier.interrupt(f"the set-point was changed to {value:g} by another node")
+            why = f"the set-point was changed to {value:g} by another node"
+            self._verifier.interrupt(Code.INTERFERED(sentence=why))
         self._setpoint = value
 
     def _on_command(self, message: Float64) -> None:
@@ -285,11 +286,12 @@ class ControllerNode(ServedNode):
     def _on_hold(self, message: Bool) -> None:
         self._held = message.data
         if self._held:
-            self._verifier.interrupt("a tune has begun")
+            self._verifier.interrupt(Code.INTERFERED(sentence="a tune has begun"))
 
     def _switch(self, request: SetBool.Request) -> str:
         if not request.data:
-            self._verifier.interrupt("the controller was switched to manual")
+            why = "the controller was switched to manual"
+            self._verifier.interrupt(Code.INTERFERED(sentence=why))
         self._pid.switch(automatic=request.data)
         if self._pid.is_automatic != request.data:
             raise TuningError("there are no gains yet: the command is held")
@@ -367,7 +369,7 @@ class ControllerNode(ServedNode):
         """
         if self._pending is None:
             raise TuningError(
-                f"{tables.NONE_WAIT}; {self._refused}" if self._refused else tables.NONE_WAIT
+                Code.NONE_WAIT(**({"refused": self._refused} if self._refused else {}))
             )
         name, gains = self._pending
         try:
@@ -423,11 +425,11 @@ class ControllerNode(ServedNode):
 
     async def _prepare_verification(self, request: Verify.Goal) -> Verifiable:
         if self._held:
-            raise NotReadyError("a tune is running")
+            raise NotReadyError(Code.TUNING())
         self._verifier.require_samples()
         self._predictors.require_any()
         if self._remote is None and self._untaken:
-            raise NotReadyError(f"nobody subscribes to {self._commands.topic_name}")
+            raise NotReadyError(Code.NOBODY_SUBSCRIBES(topic=self._commands.topic_name))
         if self._remote is not None:
             self._remote.require_ready()
         new, settles = None, math.nan
@@ -437,13 +439,10 @@ class ControllerNode(ServedNode):
             self._predictors.applied(new, name)
         kept = new or await self._place.read() or self._keeper.history.gains
         if kept is None or (self._remote is None and self._pid.is_manual):
-            raise NotReadyError("the controller is not in automatic, or has no gains")
+            raise NotReadyError(Code.NOT_AUTOMATIC())
         model, doubt = self._predictors.of(kept)
         if doubt and not self.get_parameter("accept_doubtful").value:
-            raise NotReadyError(
-                f"the model that would predict the step is {doubt}; set the parameter "
-                "accept_doubtful to true to step all the same"
-            )
+            raise NotReadyError(Code.DOUBTFUL_MODEL(doubt=doubt))
         steps, limits = self._steps_of(request), self._settings.limits
         controller = self._place.controller_of(kept)
         return Verifiable(steps, new, settles, controller, model, limits, self._rate)
@@ -509,7 +508,7 @@ class ControllerNode(ServedNode):
         rested = self._verifier.rested_at
         at_work = self._verifier.is_running or self._keeper.is_at_work
         self._ending = True
-        self._verifier.interrupt(str(reason))
+        self._verifier.interrupt(reason)
         if self._remote is not None:
             self._remote.wait_for_setpoint(ACKNOWLEDGE)
         elif self._commanded and not self._held:

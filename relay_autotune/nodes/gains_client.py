@@ -17,11 +17,11 @@ from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
 from relay_autotune.control import verification
-from relay_autotune.control.gains_history import AT_WORK
 from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import (
     gains_from_message,
     made_visible,
+    reason_from_message,
     record_from_message,
     transfer_function_from_message,
 )
@@ -30,8 +30,9 @@ from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.gains_place import controller_of, mapping_of
 from relay_autotune.nodes.loop_client import ANSWER_WITHIN, GoneError, LoopClient
-from relay_autotune.nodes.tables import FIXED, GAINS, NONE_WAIT, rate_from
+from relay_autotune.nodes.tables import FIXED, GAINS, rate_from
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.reasons import may_pass
 from relay_autotune.record.record import Record
 from relay_autotune.text import TOLD_EVERY, duration, visible
 from relay_autotune_msgs.action import Verify
@@ -45,18 +46,6 @@ _TURN = 0.1
 LIMITS = ("measurement_min", "measurement_max", "command_min", "command_max")
 # Relative difference of equal gains, since another node may round them.
 _SAME = 1e-9
-# Parts of the refusals of a node that has just started, until it has found the others.
-_NOT_YET = (
-    "is not there, or has no parameter services",
-    "no model has come",
-    "nobody takes a set-point",
-    "has been heard",
-    "have come with a command",
-    "nobody subscribes to",
-    NONE_WAIT,
-    AT_WORK,
-    "gains of before are being brought back",
-)
 
 
 class GainsClient(LoopClient):
@@ -177,7 +166,8 @@ class GainsClient(LoopClient):
             answer = self.call(Trigger, f"{self.name}/{service}", Trigger.Request())
             if answer.success:
                 return str(answer.message)
-            if not _is_early(answer.message) or time.monotonic() > deadline:
+            # A Trigger has no field for a code.
+            if not may_pass(answer.message) or time.monotonic() > deadline:
                 raise LoopError(f"{self.name} refuses: {answer.message}")
             if said := done():
                 return said
@@ -404,7 +394,8 @@ class GainsClient(LoopClient):
             result = made_visible(answer.result)
             if answer.status == GoalStatus.STATUS_SUCCEEDED:
                 return result
-            if not _is_early(result.reason) or time.monotonic() - begun > ANSWER_WITHIN:
+            early = reason_from_message(result.why).code.row.transient
+            if not early or time.monotonic() - begun > ANSWER_WITHIN:
                 raise LoopError(f"{self.name} has not verified the gains: {result.reason}")
             # auto_apply may be faster.
             goal.apply = goal.apply and not (new is not None and self.has(new))
@@ -427,8 +418,3 @@ class GainsClient(LoopClient):
                 raise GoneError(f"{self.name} has gone during the verification")
             if time.monotonic() >= until:
                 raise GoneError(f"{self.name} has not ended the verification")
-
-
-def _is_early(reason: str) -> bool:
-    """Return whether a refusal may disappear without action."""
-    return any(part in reason for part in _NOT_YET)

@@ -17,7 +17,7 @@ import os
 import stat
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,6 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 
 from relay_autotune.control.controller import LARGEST_GAIN
 from relay_autotune.control.gains_history import (
-    AT_WORK,
     KEPT,
     KNOWN,
     Entry,
@@ -38,6 +37,7 @@ from relay_autotune.control.gains_history import (
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.gains_place import Place
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
+from relay_autotune.reasons import Code, reason_of
 from relay_autotune.text import visible
 
 _VERSION = 1
@@ -369,13 +369,13 @@ class GainsKeeper:
 
     def _require_idle(self) -> None:
         if self._busy:
-            raise HistoryError(AT_WORK)
+            raise HistoryError(Code.GAINS_AT_WORK())
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[None]:
         self._require_idle()
         if self._goal is not None:
-            raise HistoryError(f"gains of before are being brought back{self._open()}")
+            raise HistoryError(Code.BRINGING_BACK(open=self._open()))
         self._busy = True
         try:
             yield
@@ -396,7 +396,8 @@ class GainsKeeper:
         except RelayAutotuneError as error:
             self._goal, self._anothers = now, False
             await self._settle()
-            raise type(error)(f"{error}{self._open()}") from error
+            why = reason_of(error)
+            raise type(error)(replace(why, said=f"{why}{self._open()}")) from error
         if self._abandoned:
             raise HistoryError("the node ends: the gains of before are brought back")
 

@@ -29,6 +29,7 @@ from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.nodes.live_types import CommandMessage, reader_of
 from relay_autotune.nodes.tables import GAINS, MESSAGE_PARAMETERS, OWN_LAWS, parameters_of_law
+from relay_autotune.reasons import Code, Reason
 
 # Names of the gains that may be sent, of the ISA and of the parallel form, and the time constant
 # of a back-calculation, which belongs to them.
@@ -278,7 +279,7 @@ class RemoteGains(Place):
 
     async def _ask(self, client: Any, request: Any) -> Any:
         if not client.service_is_ready():
-            raise LoopError(f"the node {self.name} is not there, or has no parameter services")
+            raise LoopError(Code.NODE_NOT_THERE(node=self.name))
         answer = client.call_async(request)
 
         def give_up() -> None:
@@ -334,7 +335,7 @@ class RemoteLoop:
         target: str,
         setpoint: float,
         setpoints: CommandMessage,
-        disturbed: Callable[[str], None],
+        disturbed: Callable[[Reason], None],
     ) -> None:
         self.command = math.nan
         """The last command received [u]; NaN before the first."""
@@ -356,12 +357,12 @@ class RemoteLoop:
             self.command = command
             self._heard_at = time.monotonic()
 
-    def why_silent(self) -> str:
-        """Return a sentence if the other node has stopped sending commands, else ""."""
+    def why_silent(self) -> Reason | None:
+        """Return a reason if the other node has stopped sending commands."""
         silent = time.monotonic() - self._heard_at
         if silent < _SILENCE:
-            return ""
-        return f"no command of {self._target} for {silent:.3g} s"
+            return None
+        return Code.SILENT_OWNER(node=self._target, silence=silent)
 
     def require_ready(self) -> None:
         """Refuse a loop in which the effect of a set-point step could not be seen.
@@ -376,11 +377,9 @@ class RemoteLoop:
             )
         # One subscription is the node's own.
         if self._publisher.get_subscription_count() < 2:
-            raise NotReadyError(
-                f"nobody takes a set-point from {topic}: remap it to the topic of {target}"
-            )
+            raise NotReadyError(Code.NOBODY_TAKES(topic=topic, node=target))
         if math.isnan(self.command):
-            raise NotReadyError(f"no command of {target} has been heard")
+            raise NotReadyError(Code.NOT_HEARD(node=target))
         if reason := self.why_silent():
             raise NotReadyError(reason)
 
@@ -404,7 +403,8 @@ class RemoteLoop:
         try:
             value = self._setpoints.value(message)
         except FieldError as error:
-            self._disturbed(f"another node set a set-point that cannot be read: {error}")
+            why = f"another node set a set-point that cannot be read: {error}"
+            self._disturbed(Code.INTERFERED(sentence=why))
             return
         if value in self._on_the_way:
             self._on_the_way.remove(value)
@@ -415,4 +415,5 @@ class RemoteLoop:
         # The new set-point is in force already, so there is no step to take back.
         self.setpoint, self._offset = value, 0.0
         if changed:
-            self._disturbed(f"another node set the set-point to {value:g}")
+            why = f"another node set the set-point to {value:g}"
+            self._disturbed(Code.INTERFERED(sentence=why))

@@ -139,7 +139,6 @@ TUNE_PARAMETERS: tuple[Quantity, ...] = (*EXPERIMENT_PARAMETERS, *NODE_PARAMETER
 # Names of the law that the node runs by itself.
 OWN_LAWS = ("", OWN_LAW)
 # Answer of ~/apply where no gains have come since the last were applied or discarded.
-NONE_WAIT = "no gains wait to be applied"
 GAINS = (
     Quantity("kc", 0.0, "u/y", -LARGEST_GAIN, LARGEST_GAIN).means(
         "Proportional gain, with the sign of the process; 0: no gains yet, the command is held."

@@ -9,7 +9,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, auto
 from functools import partial
 from typing import Any
@@ -22,7 +22,7 @@ from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import Plan, Step, compare, plan
 from relay_autotune.errors import NotReadyError, RelayAutotuneError
 from relay_autotune.exchange.fields import float64_array
-from relay_autotune.exchange.messages import set_stamp
+from relay_autotune.exchange.messages import fill_reason, reason_from_message, set_stamp
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LawRate
 from relay_autotune.loop.sampled import Limits
@@ -31,6 +31,7 @@ from relay_autotune.nodes.goals import Narrator, OneGoal, conclude
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.nodes.results import keep
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.reasons import NONE, Code, Reason, other, reason_of
 from relay_autotune.text import duration
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import Verification
@@ -102,9 +103,7 @@ class Predictors:
         :raises NotReadyError: if no model has come.
         """
         if not self._models:
-            raise NotReadyError(
-                "no model has come, so the step cannot be predicted; run a tune first"
-            )
+            raise NotReadyError(Code.NO_MODEL_YET())
 
     def of(self, gains: GainSet) -> tuple[TransferFunction, str]:
         """Return the model that predicts a step with some gains, and why it is doubtful.
@@ -118,10 +117,7 @@ class Predictors:
         name = next((n for known, n in self._experiments.items() if known.is_near(gains)), "")
         newest = list(self._models)[-1]
         if name not in self._models and name and newest:
-            raise NotReadyError(
-                f"the gains are of the experiment {name}, and its model has not come; the newest "
-                f"one is of {newest}: try again when the model has come, or run a tune"
-            )
+            raise NotReadyError(Code.OTHER_EXPERIMENT(experiment=name, newest=newest))
         return self._models[name if name in self._models else newest]
 
 
@@ -202,7 +198,7 @@ class Verifier:
             node, Verification, "verification", quality.latched(_STEPS_KEPT)
         )
         self._action = OneGoal(
-            node, Verify, "~/verify", self._accept, partial(self.interrupt, "cancelled")
+            node, Verify, "~/verify", self._accept, partial(self.interrupt, Code.CANCELLED())
         )
 
     @property
@@ -224,19 +220,16 @@ class Verifier:
         :raises NotReadyError: if there are too few samples to know the loop's rest.
         """
         if len(self._recent) < _LEAST_BEFORE:
-            raise NotReadyError(
-                f"only {len(self._recent)} samples have come with a command, expected "
-                f"{_LEAST_BEFORE}"
-            )
+            raise NotReadyError(Code.FEW_SAMPLES(samples=len(self._recent), needed=_LEAST_BEFORE))
 
     def _accept(self, goal: Any) -> None:
-        patience, reason = goal.request.patience, ""
+        patience, why = goal.request.patience, NONE
         if self._action.running is not None:
-            reason = "a verification is running"
+            why = Code.VERIFYING()
         elif not 0.0 <= patience <= LONGEST_TIME:
-            reason = f"patience is {patience:g} s, expected 0 to {LONGEST_TIME:g} s"
-        if reason:
-            conclude(goal, Verify.Result(passed=False, reason=reason), succeeded=False)
+            why = other(f"patience is {patience:g} s, expected 0 to {LONGEST_TIME:g} s")
+        if why:
+            conclude(goal, _result(False, why, str(why)), succeeded=False)
             return
         self._action.running, self._phase, self._found = goal, _Phase.PREPARING, []
         self._outcome, self._waits_for = Future(), ""
@@ -250,16 +243,17 @@ class Verifier:
         try:
             await self._begin(goal.request)
         except Exception as error:  # noqa: BLE001  the loop goes on, and the client is told
-            self._end(None, _said(error), succeeded=False)
-        passed, reason, succeeded = await self._outcome
+            self._end(None, _why(error), succeeded=False)
+        passed, why, succeeded = await self._outcome
+        reason = str(why)
         try:
             reason = await self._ended(passed, reason)
         except Exception as error:  # noqa: BLE001
-            reason = f"{reason}; {_said(error)}"
+            reason = f"{reason}; {_why(error)}"
         self._watch.cancel()
         self._action.running, self._phase = None, _Phase.IDLE
         steps = [without_arrays(message) for message in self._found]
-        result = Verify.Result(passed=passed is True, reason=reason, steps=steps)
+        result = _result(passed is True, why, reason, steps)
         self._found = []
         conclude(goal, result, succeeded=succeeded)
 
@@ -354,16 +348,13 @@ class Verifier:
         t, y, u = (np.array(column) for column in zip(*self._recent, strict=True))
         period = float(np.median(np.diff(t)))
         if not period > 0.0:
-            raise NotReadyError("the time of the samples stands still: is /clock published?")
+            raise NotReadyError(Code.STEP_TIME_STANDS())
         line = np.polyfit(t - t[0], y, 1)
         noise = float(np.std(y - np.polyval(line, t - t[0]), ddof=2))
         drift = abs(float(line[0])) * float(t[-1] - t[0])
         smallest = min((abs(s.setpoint) for s in steps if s.setpoint), default=math.inf)
         if drift > 4.0 * noise and drift > 0.1 * smallest:
-            raise NotReadyError(
-                f"the loop is not at rest: the measurement moved by {drift:.3g} over the last "
-                f"{len(self._recent)} samples; wait until it has settled"
-            )
+            raise NotReadyError(Code.NOT_AT_REST(drift=drift, samples=len(self._recent)))
         return Rest(float(y.mean()), float(u.mean()), noise), period
 
     def _begin_step(self) -> None:
@@ -398,10 +389,10 @@ class Verifier:
         wanted = self._plans[self._number]
         hole = max(_SILENT_INTERVALS * self._period, _LARGEST_HOLE * wanted.duration)
         if since < 0.0:
-            self.interrupt(f"time went backwards, by {-since:.3g} s")
+            self.interrupt(Code.STEP_TIME_BACKWARDS(by=-since))
             return
         if since > hole:
-            self.interrupt(f"the samples' time went on by {since:.3g} s from one to the next")
+            self.interrupt(Code.STEP_GAP(by=since))
             return
         self._samples.append(sample)
         over = at - self._samples[0][0] >= wanted.duration
@@ -413,11 +404,7 @@ class Verifier:
         away = abs(measurement - self._rest.measurement)
         self._beyond = self._beyond + 1 if away > wanted.runaway else 0
         if self._beyond >= _IN_A_ROW:
-            self._end(
-                False,
-                f"the measurement went {away:.3g} away from where it was, more than "
-                f"{wanted.runaway:.3g}: three times what was predicted",
-            )
+            self._end(False, Code.STEP_RAN_AWAY(away=away, most=wanted.runaway))
         elif over:
             self._return()
 
@@ -426,7 +413,7 @@ class Verifier:
         self._beyond += 1
         tried = self._phase in (_Phase.SETTLING, _Phase.STEPPING)
         if tried and self._beyond >= _IN_A_ROW:
-            self._end(False, f"the measurement left its range, to {measurement:.6g}")
+            self._end(False, Code.STEP_OUT_OF_RANGE(value=measurement))
 
     def _return(self) -> None:
         """Remove the step, and judge it meanwhile."""
@@ -446,14 +433,17 @@ class Verifier:
         if goal is not self._action.running or self._phase is not _Phase.RETURNING:
             return
         if isinstance(message, Exception):
-            self.interrupt(f"the step could not be judged: {_said(message)}")
+            self.interrupt(Code.NOT_JUDGED(why=str(_why(message))))
             return
         self._found.append(message)
         self._full.publish(message)
+        whys = [reason_from_message(m.why, m.reason) for m in self._found]
         if not message.passed:
-            self._end(False, message.reason)
+            self._end(False, whys[-1])
         elif len(self._found) == len(self._tried.steps):
-            self._end(True, "; ".join(m.reason for m in self._found))
+            said = "; ".join(map(str, whys))
+            worst = max(whys, key=lambda why: why.code)
+            self._end(True, replace(worst, said=said))
 
     def _go_on(self) -> None:
         last = self._samples[-_BEFORE:]
@@ -499,16 +489,16 @@ class Verifier:
 
     # Ending.
 
-    def interrupt(self, reason: str) -> None:
+    def interrupt(self, why: Reason) -> None:
         """End the verification without a verdict."""
-        self._end(None, reason)
+        self._end(None, why)
 
     def _look(self) -> None:
         if not self._next_look.done():
             self._next_look.set_result(None)
         now = time.monotonic()
         if now > self._until:
-            self.interrupt("the verification took far longer than planned on the steady clock")
+            self.interrupt(Code.STEP_OVERTIME())
             return
         if self._phase is _Phase.PREPARING or not self._arrivals:
             return
@@ -516,18 +506,18 @@ class Verifier:
         usual = (arrivals[-1] - arrivals[0]) / max(len(arrivals) - 1, 1)
         patience = max(_SILENCE, _SILENT_INTERVALS * usual)
         if now - arrivals[-1] > patience:
-            self.interrupt(f"no measurement for {now - arrivals[-1]:.3g} s")
+            self.interrupt(Code.STEP_SILENT(silence=now - arrivals[-1]))
         elif now - self._advanced > patience:
-            self.interrupt("the time of the samples stands still: is /clock published?")
+            self.interrupt(Code.STEP_TIME_STANDS())
 
-    def _end(self, passed: bool | None, reason: str, *, succeeded: bool = True) -> None:
+    def _end(self, passed: bool | None, why: Reason, *, succeeded: bool = True) -> None:
         if self._phase in (_Phase.IDLE, _Phase.ENDING):
             return
         if self._phase in (_Phase.STEPPING, _Phase.RETURNING):
             self._move(0.0, 0.0)
         self._phase = _Phase.ENDING
         # As a task, so that the executor wakes.
-        self._node.executor.create_task(self._outcome.set_result, (passed, reason, succeeded))
+        self._node.executor.create_task(self._outcome.set_result, (passed, why, succeeded))
 
 
 def judged(
@@ -567,6 +557,7 @@ def judged(
         command=float64_array(u),
         predicted=float64_array(rest.measurement + found.predicted),
     )
+    fill_reason(message.why, found.why)
     for name in ("passed", "reason", "fit", "gain_ratio", "ms", "ms_predicted"):
         setattr(message, name, getattr(found, name))
     for name in ("overshoot", "settling_time", "iae"):
@@ -585,6 +576,20 @@ def without_arrays(message: Any) -> Any:
     return summary
 
 
-def _said(error: Exception) -> str:
-    known = isinstance(error, RelayAutotuneError)
-    return str(error) if known else f"{type(error).__name__}: {error}"
+def _why(error: Exception) -> Reason:
+    if isinstance(error, RelayAutotuneError):
+        return reason_of(error)
+    return other(f"{type(error).__name__}: {error}")
+
+
+def _result(passed: bool, why: Reason, reason: str, steps: Sequence[Any] = ()) -> Any:
+    """Return the result for the client.
+
+    :param passed: whether all steps passed.
+    :param why: the reason.
+    :param reason: the sentence, with what became of the gains.
+    :param steps: those that were made, without arrays.
+    """
+    result = Verify.Result(passed=passed, reason=reason, steps=list(steps))
+    fill_reason(result.why, why)
+    return result

@@ -20,10 +20,11 @@ from relay_autotune.cli.terminal import labelled
 from relay_autotune.cli.tune_page import GainsPage
 from relay_autotune.control.verification import StepRange
 from relay_autotune.errors import LoopError, TuningError
-from relay_autotune.exchange.messages import fill_gains
+from relay_autotune.exchange.messages import fill_gains, fill_reason
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.verifier import without_arrays
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.reasons import Code
 from relay_autotune.tuning import DesignOptions, DesignTask, design
 from relay_autotune.web.live import APPLY, VERIFY, PageCommand
 from relay_autotune_msgs.action import Verify
@@ -91,7 +92,9 @@ def test_an_overshoot_that_the_noise_could_move_has_its_uncertainty() -> None:
 
 
 def test_what_passed_close_to_a_limit_is_called_narrow() -> None:
-    close = step(reason="narrowly: the gain is 0.66 times the model's, 0.6 to 1.7 passes; numbers")
+    close = step()
+    narrow = "the gain is 0.66 times the model's, 0.6 to 1.7 passes"
+    fill_reason(close.why, Code.NARROWLY(narrow=narrow, numbers="numbers"))
     result = Verify.Result(passed=True, reason="long", steps=[step(), close])
     first = laid_out(verdict_entries(result, None), 99)[0]
     assert first.split(maxsplit=1)[1] == (

@@ -15,7 +15,6 @@ from scipy.integrate import solve_ivp
 
 from relay_autotune.control.controller import GainBounds, PidController, run_loop
 from relay_autotune.control.verification import (
-    NARROWLY,
     Step,
     StepRange,
     allowed_steps,
@@ -31,6 +30,7 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.reasons import Code
 from relay_autotune.record.record import Record, RelaySettings
 
 GAINS = Controller(kc=1.2, ti=2.0)
@@ -185,9 +185,11 @@ def test_what_is_close_to_its_limit_passes_narrowly_with_the_limit(factor, step)
     other = replace(PROCESS, gain=factor * PROCESS.gain)
     found = compare(GAINS, PROCESS, step, *measured(other, step))
     assert found.passed
-    assert found.reason.startswith(NARROWLY)
-    assert f"the gain is {factor:.2f} times the model's, 0.6 to 1.7 passes" in found.reason
-    assert not compare(GAINS, PROCESS, step, *measured(PROCESS, step)).reason.startswith(NARROWLY)
+    assert found.why.code is Code.NARROWLY
+    near = f"the gain is {factor:.2f} times the model's, 0.6 to 1.7 passes"
+    assert near in str(found.why["narrow"])
+    same = compare(GAINS, PROCESS, step, *measured(PROCESS, step))
+    assert same.why.code is Code.AS_PREDICTED
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 
 from relay_autotune.errors import NotReadyError, RecordError
 from relay_autotune.exchange.messages import fill_reason, reason_from_message
-from relay_autotune.reasons import NONE, Code, Reason, joined, other, reason_of
+from relay_autotune.reasons import NONE, Code, Reason, joined, may_pass, other, reason_of
 from tools.fill_docs import REASON_FILE, reason_file
 
 WORDS = re.compile(r"{(\w+)(?::([^}]*))?}")
@@ -67,6 +67,13 @@ def test_an_error_carries_a_reason_or_a_sentence():
     assert reason_of(NotReadyError(Code.NO_CLOCK())).code is Code.NO_CLOCK
     assert str(NotReadyError(Code.NO_CLOCK())) == str(Code.NO_CLOCK())
     assert reason_of(RecordError("no sample")) == other("no sample")
+
+
+def test_a_sentence_alone_tells_whether_it_may_pass():
+    wrapped = f"the gains of x are not in force: {Code.GAINS_AT_WORK()}; try later"
+    assert may_pass(wrapped)
+    assert may_pass(str(Code.FEW_SAMPLES(samples=3, needed=50)))
+    assert not may_pass(str(Code.NOT_AUTOMATIC())) and not may_pass("")
 
 
 @pytest.mark.parametrize("code", Code, ids=lambda c: c.name)
