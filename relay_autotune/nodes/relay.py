@@ -117,9 +117,9 @@ class RelayNode(ServedNode):
         if self._ahead:
             self._ahead -= 1
         elif session is not None:
-            if self._reader.stamp_ns is not None:
-                info["source_timestamp"] = self._reader.stamp_ns(message)
-            command = session.answer(value, info)
+            stamp = self._reader.stamp_ns
+            source = info["source_timestamp"] if stamp is None else stamp(message)
+            command = session.answer(value, source, info["received_timestamp"])
             if command is not None:
                 self._respond(session, command)
             elif session.may_be_no_repeat:

@@ -117,8 +117,9 @@ class Session:
         else:
             self.answer = self._answer_by_stamp
 
-    answer: Callable[[float, Mapping[str, Any]], float | None]
-    """Take a measurement and its message info; return the command, or None for no answer."""
+    answer: Callable[[float, int | None, int | None], float | None]
+    """Take a measurement, when it was measured and when it arrived [ns]; None: not known. Return
+    the command, or None for no answer."""
 
     @property
     def has_news(self) -> bool:
@@ -250,9 +251,11 @@ class Session:
         self._last = (received, source, measurement, command)
         return command
 
-    def _answer_by_stamp(self, measurement: float, info: Mapping[str, Any]) -> float:
-        received = info["received_timestamp"] or time.time_ns()
-        source = info["source_timestamp"] or received
+    def _answer_by_stamp(
+        self, measurement: float, source: int | None, received: int | None
+    ) -> float:
+        received = received or time.time_ns()
+        source = source or received
         if self._one_clock:
             # A simulated robot's clock may run at another pace than ours.
             received = source
@@ -264,22 +267,24 @@ class Session:
             self._last = (received, source, measurement, command)
         return command
 
-    def _answer_by_arrival(self, measurement: float, info: Mapping[str, Any]) -> float:
-        received = info["received_timestamp"] or time.time_ns()
+    def _answer_by_arrival(self, measurement: float, _: int | None, received: int | None) -> float:
+        received = received or time.time_ns()
         if 0 < self._repeated_ns - received < _LONGEST_WAIT_NS:
             # The message waited in the queue while the value before it was repeated.
             received = self._repeated_ns
         return self._answer_at(received, received, measurement, self._step)
 
-    def _answer_by_clock(self, measurement: float, _: Mapping[str, Any]) -> float:
+    def _answer_by_clock(self, measurement: float, *_: int | None) -> float:
         now = self.now_ns()
         return self._answer_at(now, now, measurement, self._step)
 
-    def _answer_by_number(self, measurement: float, info: Mapping[str, Any]) -> float | None:
+    def _answer_by_number(
+        self, measurement: float, source: int | None, _: int | None = None
+    ) -> float | None:
         k = self.sample_count
         if k == 0:
-            self.start_ns = info["source_timestamp"] or time.time_ns()
-        elif k == 1 and self._repeats(measurement, info["source_timestamp"]):
+            self.start_ns = source or time.time_ns()
+        elif k == 1 and self._repeats(measurement, source):
             return None
         self.sample_count = k + 1
         sampled = k * self._period
@@ -305,7 +310,7 @@ class Session:
         if not self.may_be_no_repeat or self.sample_count != 1:
             return None
         self.may_be_no_repeat = False
-        return self._answer_by_number(self._last[2], {"source_timestamp": None})
+        return self._answer_by_number(self._last[2], None)
 
 
 # A relay experiment on the set-point: the present loop stays closed.

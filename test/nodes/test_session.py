@@ -22,10 +22,6 @@ def experiment() -> RelayExperiment:
     return RelayExperiment(ExperimentParameters(amplitude=1.0, settle_time=100.0), 0.5, "one")
 
 
-def info(source: int | None, received: int | None = None) -> dict[str, Any]:
-    return {"source_timestamp": source, "received_timestamp": received}
-
-
 def test_samples_are_timed_by_their_source_stamps() -> None:
     session = Session(experiment(), "one")
     kept: list[Any] = []
@@ -33,7 +29,7 @@ def test_samples_are_timed_by_their_source_stamps() -> None:
     start = 1_700_000_000_000_000_000
     for k, source in enumerate((start, start + 90_000_001, start + 210_000_000)):
         before = time.time_ns()
-        assert session.answer(float(k), info(source, source + 5_000)) == 0.5
+        assert session.answer(float(k), source, source + 5_000) == 0.5
         session.answered()
         assert before <= kept[-1][3] <= time.time_ns()
     record = session.record()
@@ -48,7 +44,7 @@ def test_where_the_stamps_are_the_only_clock_a_simulation_may_run_at_any_pace() 
     session = Session(experiment(), "one", one_clock=True)
     for k in range(300):
         # Half as fast as our clock, which the stamps would otherwise be held against.
-        assert session.answer(1.0, info(10_000_000 * (k + 1), 20_000_000 * k)) == 0.5
+        assert session.answer(1.0, 10_000_000 * (k + 1), 20_000_000 * k) == 0.5
         session.answered()
     assert not session.experiment.finished
     record = session.record()
@@ -60,7 +56,7 @@ def test_where_the_stamps_are_the_only_clock_a_simulation_may_run_at_any_pace() 
 def test_without_source_stamps_the_arrival_counts() -> None:
     session = Session(experiment(), "one")
     for received in (10, 30, 60):
-        session.answer(0.0, info(None, received * 10**9))
+        session.answer(0.0, None, received * 10**9)
         session.answered()
     assert list(session.record().time) == pytest.approx([0.0, 20.0, 50.0])
 
@@ -69,7 +65,7 @@ def test_simulated_time_is_the_clocks() -> None:
     now = iter([5_000_000_000, 5_000_000_000, 5_100_000_000, 5_100_000_000])
     session = Session(experiment(), "one", clock=lambda: next(now))
     for _ in range(2):
-        session.answer(0.0, info(time.time_ns(), time.time_ns()))
+        session.answer(0.0, time.time_ns(), time.time_ns())
         session.answered()
     record = session.record()
     assert list(record.time) == pytest.approx([0.0, 0.1])
@@ -90,7 +86,7 @@ def test_repeated_samples_and_arrivals_are_of_one_clock(monkeypatch: pytest.Monk
         if repeated:
             session.repeat(4.0)
         else:
-            session.answer(4.5, info(now - 5_000_000_000, now))
+            session.answer(4.5, now - 5_000_000_000, now)
         session.answered()
     # What waited while a value was repeated counts from then on.
     expected = [0.0, 0.02, 0.033, 0.053, 0.053, 0.053, 0.06]
@@ -104,7 +100,7 @@ def test_repeated_samples_and_arrivals_are_of_one_clock(monkeypatch: pytest.Monk
 def test_a_simulated_clock_that_goes_back_is_noticed_while_the_sensor_is_silent() -> None:
     now = [5_000_000_000]
     session = Session(experiment(), "one", clock=lambda: now[0], repeats=True)
-    session.answer(4.0, info(time.time_ns(), time.time_ns()))
+    session.answer(4.0, time.time_ns(), time.time_ns())
     session.answered()
     now[0] = 5_400_000_000
     assert session.repeat(4.0) == 0.5
@@ -121,13 +117,13 @@ class Lockstep:
 
     def __init__(self) -> None:
         self.session = Session(experiment(), "one", sample_period=0.1)
-        self.session.answer(7.0, info(time.time_ns()))
+        self.session.answer(7.0, time.time_ns(), None)
         self.answered_at = time.time_ns()
         self.session.answered()
 
     def take(self, value: float, after: float) -> float | None:
         stamp = self.answered_at + round(after * 1e9)
-        answer = self.session.answer(value, info(stamp))
+        answer = self.session.answer(value, stamp, None)
         if answer is not None:
             self.session.answered()
         return answer
