@@ -157,11 +157,17 @@ def reasons_table(first: int) -> str:
     """
     stop = first + 50 if first % 100 or first == 200 else first + 100
     lines = ["| code | sentence | what is behind it, and what to do |", "|---|---|---|"]
+    before = ""
     for code in sorted(Code):
         row = code.row
         if first <= code < stop and row.meaning:
             remedy = row.remedy and f" {row.remedy[0].upper()}{row.remedy[1:]}."
             found, then = (re.sub(r":[^{}]*}", "}", t) for t in (row.found, row.meaning + remedy))
+            # What a sentence may leave out, and what it has in common with the one before, is cut.
+            whole = re.sub(r"\[[^]]*\]", "", found)
+            head, _, last = whole.rpartition("; ")
+            found = f"... {last}" if head and head == before else whole
+            before = head
             cells = (f"{code} `{code.name}`", f"`{found}`", then)
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
