@@ -483,6 +483,8 @@ class Found:
             return "never reached"
         if not self.open:
             return "decides nothing"
+        if not self.tried:
+            return "may decide"
         return "decides" if any(self.changed.values()) else "changes nothing"
 
 
@@ -531,7 +533,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--records", type=int, default=20, help="of each benchmark, at most")
     parser.add_argument("--folder", type=Path, help="take the .csv files of a folder instead")
-    parser.add_argument("--tries", type=int, default=4, help="records for each moved limit")
+    parser.add_argument("--tries", type=int, default=4, help="records a moved limit; 0: move none")
     parser.add_argument("--most-seconds", type=float, default=3.0, help="of a record's analysis")
     parser.add_argument("--only", default="", help="limits whose module or name has this in it")
     parser.add_argument("--file", type=Path, help="one line for each limit as it is done")
