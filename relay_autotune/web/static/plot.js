@@ -152,7 +152,7 @@ export class Plot {
       const long = label.getComputedTextLength();
       const free = [[9, 0], [-9 - long, 0], [-long / 2, -14], [-long / 2, 14]].find(([dx, dy]) => {
         const box = { y: y + dy, start: x + dx, end: x + dx + long };
-        return box.start >= left && box.end <= width - right && taken.every((t) => Math.abs(t.y - box.y) > 13 || box.start > t.end + 3 || box.end < t.start - 3);
+        return box.start >= left && box.end <= width - right && box.y > top + 8 && box.y < height - below - 6 && taken.every((t) => Math.abs(t.y - box.y) > 13 || box.start > t.end + 3 || box.end < t.start - 3);
       });
       if (!free) { label.remove(); continue; }
       taken.push({ y: y + free[1], start: x + free[0], end: x + free[0] + long });
