@@ -200,8 +200,9 @@ class Session:
             signals.obey()
             signals.raise_if_came()
         loops = self._looked_at(kind)
-        deadline = time.monotonic() + self._started(loops)
-        self._find(loops, deadline)
+        patience = self._started(loops)
+        deadline = time.monotonic() + patience
+        self._find(loops, patience)
         loop = loops[0]
         print("".join(f"{line}\n" for line in check_lines(loop.plan(), width())), end="",
               file=sys.stderr, flush=True)  # fmt: skip
@@ -278,13 +279,13 @@ class Session:
                 patience = max(patience, START_WITHIN)
         return patience
 
-    def _find(self, loops: Sequence[Loop], deadline: float) -> None:
+    def _find(self, loops: Sequence[Loop], patience: float) -> None:
         options = self._options
         for loop in loops:
             what = "starting the nodes for" if loop.has_own_nodes else "looking for"
             with Working(f"{what} {loop.title}"):
                 loop.client.find(
-                    max(deadline - time.monotonic(), 0.0),
+                    patience,
                     needs_identifier=not (options.dry_run or options.record_only),
                     leave=lambda: bool(self._signals.came),
                 )
