@@ -13,6 +13,8 @@ they are shown.
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Mapping
 from datetime import UTC, datetime
 
 from relay_autotune.errors import visible as visible
@@ -90,3 +92,47 @@ def cell(text: str) -> str:
     """
     text = visible(text)
     return f"'{text}" if text.startswith(_FORMULA) else text
+
+
+# Where y and u stand for units: in a quotient, behind a number, or in brackets.
+_QUOTIENT = re.compile(r"(?<![\w/])(u/\(y s\)|y/\(u s\)|u s/y|y s/u|u/y|y/u)(?![\w/])")
+_SINGLE = re.compile(r"(?<=\d )([yu])(?![\w/(])|(?<=\[)([yu])(?=[\],])")
+
+
+def in_units(text: str, units: Mapping[str, str]) -> str:
+    """Return a text with the units of a loop in place of y and u.
+
+    >>> in_units("kc 0.6 u/y, a step by +2 y", {"y": "°C", "u": "%"})
+    'kc 0.6 %/°C, a step by +2 °C'
+
+    :param text: for people.
+    :param units: of the measurement, by "y", and of the command, by "u", as far as known.
+    """
+    if not units:
+        return text
+    below = {name: f"({unit})" if "/" in unit else unit for name, unit in units.items()}
+
+    def spelled(part: str, names: Mapping[str, str]) -> str:
+        return re.sub(r"[yu]", lambda letter: names.get(letter[0], letter[0]), part)
+
+    def quotient(found: re.Match[str]) -> str:
+        above, _, under = found[0].partition("/")
+        return f"{spelled(above, units)}/{spelled(under, below)}"
+
+    text = _QUOTIENT.sub(quotient, text)
+    return _SINGLE.sub(lambda found: units.get(found[0], found[0]), text)
+
+
+_UNIT_BEHIND = re.compile(r"(?<=[\d\s])([%°][a-zA-Z]*|[^\W\d_][\w/^*]*)\s*[)\]]?$")
+
+
+def unit_of(text: str) -> str:
+    """Return the unit that stands behind the last number of an answer; empty: none does.
+
+    >>> unit_of("20 to 35 °C"), unit_of("0-100%"), unit_of("1.5")
+    ('°C', '%', '')
+
+    :param text: as people type it.
+    """
+    found = _UNIT_BEHIND.search(text.strip())
+    return found[1] if found else ""

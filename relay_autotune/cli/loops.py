@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from relay_autotune.bag.field_path import first_numbers
 from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, ros_arguments
 from relay_autotune.cli.settings import Answers, as_flags, with_flags
-from relay_autotune.cli.terminal import Working, asked, broken, width
+from relay_autotune.cli.terminal import UNITS, Working, asked, broken, width
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
 from relay_autotune.exchange.export import Target
 from relay_autotune.reasons import Code
@@ -144,6 +144,9 @@ class TopicLoop(Loop):
     has_own_nodes = proves = True
 
     def __init__(self, client: TuneClient, options: argparse.Namespace) -> None:
+        # Imported here, because it needs ROS.
+        from relay_autotune.nodes.live_types import unit_of_field
+
         super().__init__(client, options)
         answers, measurement, command = self.answers, options.measurement, options.command
         with Working(f"looking at {measurement} and {command}"):
@@ -160,10 +163,16 @@ class TopicLoop(Loop):
                 )
         except ParameterError as error:
             raise SelectionError(as_flags(str(error))) from None
+        for letter, kind, field in (
+            ("y", self._kind, options.field),
+            ("u", self._command_kind, self._command_field),
+        ):
+            if unit := unit_of_field(kind, field):
+                UNITS[letter] = unit
         needed = [name for name in self.form[:3] if answers[name] is None]
         if options.web:
             return
-        if sys.stdin.isatty() and needed:
+        if sys.stdin.isatty() and needed and len(UNITS) < 2:
             print("u is the command's unit, y the measurement's", file=sys.stderr)
         answers.ask("at", known=answers.commanded)
         answers.ask("within")

@@ -18,10 +18,11 @@ from enum import Enum
 from typing import Any
 
 from relay_autotune.cli.arguments import finite, flag_of
-from relay_autotune.cli.terminal import asked, number_of, pair_of
+from relay_autotune.cli.terminal import UNITS, asked, number_of, pair_of
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import Quantity
+from relay_autotune.text import unit_of
 
 NOT_GIVEN = math.nan
 
@@ -251,9 +252,15 @@ class Answers:
         example = example or shown or setting.example
         seen = "" if shown else self.now(name)
         question = f"{what or setting.question} [{SETTING[name].unit}]" + f", {seen}" * bool(seen)
+
+        def read(text: str) -> Any:
+            if (unit := unit_of(text)) and setting.read(text) is not None:
+                UNITS[setting.unit] = unit
+            return setting.read(text)
+
         value = asked(
-            question, flag_of(setting), shown, example, setting.read,
-            lambda found: self.why_impossible(name, found),
+            question, flag_of(setting), shown, example, read,
+            lambda found: self.why_impossible(name, found), pair=setting.ends > 1,
         )  # fmt: skip
         self.take({name: value}, "typed")
 

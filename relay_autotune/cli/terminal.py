@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError
-from relay_autotune.text import LOGGED_EVERY, TOLD_EVERY, duration, visible
+from relay_autotune.text import LOGGED_EVERY, TOLD_EVERY, duration, in_units, visible
 
 if TYPE_CHECKING:
     from relay_autotune.control.verification import StepRange
@@ -35,6 +35,10 @@ _INDENT = "  "
 _LABEL = 16
 # Quantities on one line stand this far apart.
 _GAP = "   "
+
+
+UNITS: dict[str, str] = {}
+"""What y and u stand for in this process, as far as its loop is known."""
 
 
 def width() -> int:
@@ -59,6 +63,7 @@ def broken(text: str, columns: int) -> list[str]:
     :param columns: that a line may have.
     :return: at least one line.
     """
+    text = in_units(text, UNITS)
     if len(text) <= columns:
         return [text]
     lines: list[str] = []
@@ -127,6 +132,7 @@ def in_columns(rows: Sequence[Sequence[str]], columns: int) -> list[str]:
     :param rows: of the same number of cells.
     :param columns: that a line may have; where they do not suffice, the columns stand closer.
     """
+    rows = [[in_units(cell, UNITS) for cell in row] for row in rows]
     needed = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
     gap = 2 if sum(needed) + 2 * len(needed) <= columns else 1
     first, *others = needed
@@ -193,7 +199,7 @@ class StatusLine:
 
     def __call__(self, status: str) -> None:
         """Show a sentence."""
-        status, now = visible(status), time.monotonic()
+        status, now = in_units(visible(status), UNITS), time.monotonic()
         begun = status.partition(",")[0]
         if not self.in_place and begun == self._last and now - self._at < LOGGED_EVERY:
             return
@@ -399,6 +405,8 @@ def asked(
     example: str,
     read: Callable[[str], Any],
     why_impossible: Callable[[Any], str] = lambda _: "",
+    *,
+    pair: bool = False,
 ) -> Any:
     """Ask for a value until it can be read and can be.
 
@@ -408,13 +416,18 @@ def asked(
     :param example: what may be typed.
     :param read: returns the value of a text; None: it has none.
     :param why_impossible: tells why a value cannot be; empty: it can.
+    :param pair: whether two numbers are asked for.
     """
     _require_somebody(flag)
-    shown = f"{what}, such as {example}" + f" [{known}]: " * bool(known) + ": " * (not known)
+    shown = (
+        f"{in_units(what, UNITS)}, such as {example}"
+        + f" [{known}]: " * bool(known)
+        + ": " * (not known)
+    )
     while True:
         value = read(_input(shown) or known)
         if value is None:
-            found = "two numbers, the lower one first" if read is pair_of else "a number"
+            found = "two numbers, the lower one first" if pair else "a number"
             said = f"expected {found}, such as {example}"
         elif not (said := why_impossible(value)):
             return value

@@ -27,6 +27,7 @@ from relay_autotune.cli.loops import Loop
 from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN
 from relay_autotune.cli.proof import CONTROLLER, Proof
 from relay_autotune.cli.report import analysed_as_there, defaults, flags_of
+from relay_autotune.cli.terminal import UNITS
 from relay_autotune.cli.tune_view import (
     STATES,
     Paint,
@@ -81,6 +82,7 @@ class TunePage:
     def __init__(self, loops: Sequence[Loop], options: argparse.Namespace) -> None:
         lives = [Live(loop.title) for loop in loops]
         self._page = Page((), address_of(options.web_address), lives)
+        self._page.units = UNITS
         self._loops = [_LoopOnPage(loop, self._page, n) for n, loop in enumerate(loops)]
 
     def run(self, interrupted: list[int]) -> int:

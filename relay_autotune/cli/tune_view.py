@@ -21,12 +21,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TextIO
 
 from relay_autotune.cli.table import gains_lines
-from relay_autotune.cli.terminal import WIDEST, labelled
+from relay_autotune.cli.terminal import UNITS, WIDEST, labelled
 from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import transfer_function_from_message
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
-from relay_autotune.text import LOGGED_EVERY, digits, duration
+from relay_autotune.text import LOGGED_EVERY, digits, duration, in_units
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ def check_lines(checks: Sequence[str], width: int) -> list[str]:
         line
         for check in checks
         for line in textwrap.wrap(
-            check,
+            in_units(check, UNITS),
             max(width - 1, 2 * _CHECK_INDENT),
             subsequent_indent=" " * _CHECK_INDENT,
             break_long_words=False,
@@ -373,7 +373,7 @@ class Shown:
     def _write(self, text: str) -> None:
         # The tune continues even if its progress cannot be written.
         with suppress(OSError):
-            self._stream.write(text)
+            self._stream.write(in_units(text, UNITS))
             self._stream.flush()
 
 

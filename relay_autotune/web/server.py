@@ -11,7 +11,7 @@ import logging
 import mimetypes
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -34,7 +34,7 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.report.page import page as report_page
 from relay_autotune.report.page import style_sheet
-from relay_autotune.text import visible
+from relay_autotune.text import in_units, visible
 from relay_autotune.tuning import RULES
 from relay_autotune.verdict import Verdict
 from relay_autotune.web import wire
@@ -85,6 +85,8 @@ class Page:
         """Number of changes of what is shown of the models."""
         self.address = address
         self.lives = tuple(lives)
+        self.units: Mapping[str, str] = {}
+        """What y and u stand for."""
         self.computes_ahead = True
         """Whether what the slider may ask for is computed while nothing is asked."""
         self._known: dict[tuple[int, DesignRequest], str] = {}
@@ -214,7 +216,7 @@ class Page:
     def everything(self) -> str:
         """Return what a page shows whatever is asked, as JSON."""
         subjects = [wire.of_subject(subject) for subject in self.subjects]
-        return wire.to_text({"subjects": subjects, "laws": ["", *LAWS]})
+        return wire.to_text({"subjects": subjects, "laws": ["", *LAWS], "units": dict(self.units)})
 
     def tell_news(self) -> None:
         """Tell all open pages what is new of the loops that are watched."""
@@ -374,7 +376,7 @@ class _Socket(_Guarded, WebSocketHandler):
         :param text: JSON.
         """
         with suppress(WebSocketClosedError):
-            self.write_message(text)
+            self.write_message(in_units(text, self.page.units))
 
     def _tell_subjects(self) -> None:
         self._shown = self.page.revision

@@ -22,12 +22,12 @@ import yaml
 from made_experiments import record_of
 
 from relay_autotune import reasons as core
-from relay_autotune.cli import report, tune_loop
+from relay_autotune.cli import loops, report, settings, terminal, tune_loop
 from relay_autotune.cli.after_tune import AfterTune, prefix
 from relay_autotune.cli.loops import Loop, TopicLoop
 from relay_autotune.cli.own_nodes import OwnNodes, namespace_of_joint, ros_arguments
 from relay_autotune.cli.settings import Kind, kind_of, with_flags
-from relay_autotune.cli.terminal import agrees, asked_for_file, number_of, pair_of
+from relay_autotune.cli.terminal import agrees, asked_for_file, broken, number_of, pair_of
 from relay_autotune.errors import LoopError, ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS, Target, exported
 from relay_autotune.exchange.messages import fill_gains, fill_reason
@@ -38,6 +38,7 @@ from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code
+from relay_autotune.text import in_units
 from relay_autotune.tuning import DesignOptions, DesignTask, design
 from relay_autotune.verdict import Verdict
 from relay_autotune_msgs.action import Tune
@@ -245,6 +246,34 @@ def test_a_question_shows_what_is_now_and_refuses_what_cannot_be(
     said = capsys.readouterr().err
     assert "the measurement is 44 now: give limits around it" in said
     assert "the present command is 2: give limits around it" in said
+
+
+def test_units_that_are_typed_or_that_messages_say_stand_everywhere(
+    typed: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(terminal, "UNITS", units := {})
+    for module in (loops, settings):
+        monkeypatch.setattr(module, "UNITS", units)
+    typed += ["35 %", "30 50", "0 to 100 %"]
+    arguments(Looker(kind="sensor_msgs/msg/Temperature", measures=44.0), options(
+        "--field", "temperature"
+    ))  # fmt: skip
+    assert units == {"y": "°C", "u": "%"}
+    assert broken("kc 0.6 u/y   i 2 u/(y s)   5 u", 99) == ["kc 0.6 %/°C   i 2 %/(°C s)   5 %"]
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("kc 1.2 u/y, 3 y/u, 4 u s/y, 5 y s/u", "kc 1.2 V/(m/s), 3 m/s/V, 4 V s/(m/s), 5 m/s s/V"),
+        ("a step by +2 y: at 3 u", "a step by +2 m/s: at 3 V"),
+        ("measurement [y]", "measurement [m/s]"),
+        ("by you, 2 years, /u/y, u y", "by you, 2 years, /u/y, u y"),
+    ],
+)
+def test_units_take_the_place_of_their_letters_and_of_nothing_else(text: str, found: str) -> None:
+    assert in_units(text, {"y": "m/s", "u": "V"}) == found
+    assert in_units(text, {}) == text
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@
 // server is set as text, never as markup.
 
 import { Live, table } from "./live.js";
-import { Plot } from "./plot.js";
+import { Plot, units } from "./plot.js";
 
 const $ = (id) => document.getElementById(id);
 const pick = (rule) => { asked.rule = rule; showControls(); ask(); };
@@ -366,6 +366,7 @@ function take(message) {
     const before = subjects.length;
     subjects = message.subjects;
     laws = message.laws;
+    Object.assign(units, message.units);
     $("data").hidden = $("shape").hidden = !subjects.length;
     const of = Number(new URLSearchParams(location.hash.slice(1)).get("of") ?? -1);
     if (!live) { choose(of >= 0 && of < subjects.length ? of : 0); return; }

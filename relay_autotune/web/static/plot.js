@@ -39,6 +39,13 @@ function range(values) {
   return [low - room, high + room];
 }
 
+// What y and u stand for, by their letters.
+export const units = {};
+
+function named(label) {
+  return (label || "").replace(/\[(.*)\]/, (all, unit) => `[${unit.replace(/[yu]/g, (letter) => units[letter] || letter)}]`);
+}
+
 export class Plot {
   // host: an empty element; words: {label, x, y} of the figure and its axes; pick: called with the name of a mark
   constructor(host, words) {
@@ -101,9 +108,9 @@ export class Plot {
         .textContent = String(y);
     }
     element("text", { class: "axis", x: (left + width - right) / 2, y: height - 4, "text-anchor": "middle" }, svg)
-      .textContent = this.words.x || "";
+      .textContent = named(this.words.x);
     element("text", { class: "axis", transform: `translate(12 ${(top + height - below) / 2}) rotate(-90)`, "text-anchor": "middle" }, svg)
-      .textContent = this.words.y;
+      .textContent = named(this.words.y);
     const inside = element("g", { "clip-path": `url(#${clip})` }, svg);
     const at = (x, y) => `${px(x).toFixed(1)} ${py(y).toFixed(1)}`;
     if (what.areas && what.areas.length) {
