@@ -24,7 +24,7 @@ from markdown import table, three
 import numpy as np
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.loop.analysis import step_figures
+from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.stability import frequencies, margins, sensitivity_peaks
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
@@ -62,7 +62,7 @@ def load_error(controller: Controller, model: TransferFunction) -> float:
     """Return the IAE of a unit step of the load [y s/u]."""
     loop = controller.loop(model)
     found = margins(loop, frequencies(loop))
-    return step_figures(controller, model, found.ms_frequency).iae_load
+    return Loop(controller, model).figures(found.ms_frequency).iae_load
 
 
 def designed(model: TransferFunction, derivative: bool) -> Design:

@@ -29,9 +29,9 @@ from markdown import table
 import numpy as np
 
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS, Law, SampledLaw
-from relay_autotune.loop.sampled_loop import SampledLoop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Plant
@@ -127,13 +127,11 @@ def tried(title: str, model: TransferFunction, law: str, rate: float) -> Case:
         controller, _ = robust(task)
     except RelayAutotuneError as error:
         return Case(rate, law, title, why=str(error))
-    runs = task.runs(controller)
-    assert runs is not None
-    found = SampledLoop(runs, model).margins()
+    runs = task.law(controller)
+    found = Loop(runs, model).margins()
     measured = measured_ms(runs, model, found.ms_frequency)
-    unnamed = task.runs(unnamed_gains(model, period))
-    assert unnamed is not None
-    return Case(rate, law, title, found.ms, measured, SampledLoop(unnamed, model).ms())
+    unnamed = task.law(unnamed_gains(model, period))
+    return Case(rate, law, title, found.ms, measured, Loop(unnamed, model).ms())
 
 
 @lru_cache(maxsize=1)

@@ -48,7 +48,7 @@ class Shaping:
         loops = [(each.law, each.sample_period, each.loop_delay) for each in (options, others)]
         if loops[0] == loops[1]:
             # The models around are those of the same loop, and so are their responses.
-            task.__dict__.update(around=self.task.around, exact=self.task.exact)
+            task.__dict__.update(around=self.task.around)
         return replace(self, task=task)
 
     def judgement(self, gains: Gains) -> Judgement:
@@ -58,9 +58,10 @@ class Shaping:
         """
         if self.evidence is None:
             return NOT_JUDGED
+        law = self.task.law(gains)
         loop = Loop(
             controller=gains,
-            ms_of=lambda models: ensemble_peaks(gains, self.task.set_of(models)).ms,
+            ms_of=lambda models: ensemble_peaks(law, self.task.set_of(models)).ms,
             asked=max(self.task.options.ms, gains.ms),
             added_delay=self.task.options.added_delay,
         )

@@ -15,11 +15,10 @@ from scipy.special import ndtr
 from relay_autotune.arrays import FloatArray
 from relay_autotune.control.controller import run_loop, scaled
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.analysis import frequencies, is_stable, sensitivity_peaks
+from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LawRate
 from relay_autotune.loop.sampled import UNLIMITED, Limits
-from relay_autotune.loop.sampled_loop import SampledLoop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code, Reason
 from relay_autotune.record.record import Record
@@ -574,18 +573,16 @@ def runs_stably(gains: Controller, model: TransferFunction, rate: LawRate | None
     :param rate: the law that runs the gains; None: our own.
     :raises TuningError: if the law cannot run them.
     """
-    if rate is None:
-        return is_stable(gains, model)
-    return SampledLoop(rate.of(gains), model).unstable == 0
+    return _loop(gains, model, rate).unstable_poles == 0
+
+
+def _loop(gains: Controller, model: TransferFunction, rate: LawRate | None) -> Loop:
+    return Loop(gains if rate is None else rate.of(gains), model)
 
 
 def _ms(gains: Controller, model: TransferFunction, rate: LawRate | None) -> float:
-    if not runs_stably(gains, model, rate):
-        return math.nan
-    if rate is not None:
-        return SampledLoop(rate.of(gains), model).ms()
-    loop = gains.loop(model)
-    return sensitivity_peaks(loop, frequencies(loop))[0]
+    ms = _loop(gains, model, rate).ms()
+    return ms if math.isfinite(ms) else math.nan
 
 
 @dataclass(frozen=True)

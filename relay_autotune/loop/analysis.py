@@ -1,44 +1,57 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Analysis of a closed loop: responses to set-point and load, noise in the command, robustness.
+r"""A closed loop: margins, responses to set-point and load, noise in the command.
+
+The law runs once for each sample, and its command is held until the next one. With the law C and
+the process G between hold and sampler, both at ``z = exp(s h)``, ``L = C G`` exactly, and the
+measurement between the samples after a step of set-point or load, with the process itself, is
+
+    F(z)/(1 + L(z)) G(s)/s    and    1/(1 + L(z)) G(s)/s,
+
+since the hold's ``1 - z^-1`` is that of the step. A continuous controller is the limit for h -> 0.
 
 The transforms are inverted by a fast Fourier transform along ``Re s = sigma`` (Dubner and Abate
-1968); dead times enter exactly. A truncated transform cannot follow a jump at t = 0, so the jump
-is removed before the inversion and added after it. Integrals of an error are computed as
-``int |e| = |int e| + 2 int (the part of the other sign)``: the first is the transform at s = 0,
-so that a slow tail needs no computation.
+1968). Where it has the samples' own instants, transforms in z give the samples exactly. Else a
+truncated transform cannot follow a jump at t = 0, so the jump is removed before the inversion and
+added after it. Integrals of an error are computed as ``int |e| = |int e| + 2 int (the part of the
+other sign)``: the first is the transform at s = 0, so that a slow tail needs no computation.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.loop.gains import ControlLaw, Controller, Performance, StepFigures
-from relay_autotune.loop.sampled import filter_matrices
+from relay_autotune.loop.laws import LAWS, OWN_LAW, SampledLaw
 from relay_autotune.loop.stability import (
     LoopMargins,
     closed_loop_unstable_poles,
     frequencies,
     margins,
+    sampled_unstable_poles,
     sensitivity_peaks,
 )
+from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 
 _POINTS = 4096
 _MOST_POINTS = 1 << 18
 _DECAY = math.log(1e8)
-_TURNS, _RESETS, LONGEST = 6.0, 8.0, 64.0
+_TURNS, _RESETS, _LONGEST = 6.0, 8.0, 64.0
+# Least number of samples of a response, and the largest that are computed one by one.
+_LEAST_SAMPLES, _MOST_SAMPLES = 256, 1 << 14
+_ANGLES = 4096
 # The horizon is long enough if the tail of a response is below this part of the whole.
 _SETTLED = 1e-3
 # A smaller final error counts as zero.
-NO_OFFSET = 1e-3
+_NO_OFFSET = 1e-3
 BAND = 0.02
 
 
@@ -68,7 +81,13 @@ def abscissae(duration: float | FloatArray, points: int) -> ComplexArray:
     return _DECAY / (2.0 * duration) + 1j * np.arange(points + 1) * (math.pi / duration)
 
 
-def inverted(values: ComplexArray, duration: float | FloatArray, jump: float = 0.0) -> FloatArray:
+def inverted(
+    values: ComplexArray,
+    duration: float | FloatArray,
+    jump: float = 0.0,
+    *,
+    sampled: bool = False,
+) -> FloatArray:
     """Return the function of a Laplace transform at equally spaced times from 0 on.
 
     :param values: the transform at :func:`abscissae`, shape (..., points + 1); it must not have
@@ -76,164 +95,270 @@ def inverted(values: ComplexArray, duration: float | FloatArray, jump: float = 0
     :param duration: s; the last instant is one step before it; or one of each function, shape
         (k, 1).
     :param jump: value just after t = 0.
+    :param sampled: True: of a sequence with one value for each instant, times their distance.
     :return: shape (..., points).
     """
     points = values.shape[-1] - 1
     step, decay = duration / points, 20.0 / duration
     time = np.arange(points) * step
+    grown = np.exp(_DECAY / (2.0 * duration) * time) / step
+    if sampled:
+        return np.asarray(np.fft.irfft(values)[..., :points] * grown)
     if jump:
         values = values - jump / (abscissae(duration, points) + decay)
     # Lanczos' factors remove the ringing caused by the cut at the last frequency.
     values = values * np.sinc(np.arange(points + 1) / points)
-    found = np.fft.irfft(values)[..., :points] * np.exp(_DECAY / (2.0 * duration) * time) / step
+    found = np.fft.irfft(values)[..., :points] * grown
     return np.asarray(found + jump * np.exp(-decay * time) if jump else found)
 
 
-def measurement_from_load(
-    law: ControlLaw, model: TransferFunction, s: ComplexArray
-) -> ComplexArray:
-    """Return ``G/(1 + C G)`` of a closed loop.
+class Loop:
+    """A control law and a process.
 
-    :param law: the controller.
-    :param model: the process, with all dead time of the loop.
-    :param s: rad/s, any shape.
+    :param law: with its gains and its period.
+    :param model: the process, with the dead time of the loop, but none for the hold.
+    :param process: the same as the loop meets it, where it is known already.
     """
-    g = model(s)
-    return np.asarray(g / (1.0 + law(s) * g))
 
+    def __init__(
+        self, law: ControlLaw, model: TransferFunction, process: ModelSet | None = None
+    ) -> None:
+        self.law, self.model = law, model
+        self._process = process or ModelSet((model,), law.period)
 
-def _first_command(law: ControlLaw, model: TransferFunction) -> float:
-    """Return the command just after a unit step of the set-point [u]."""
-    constants = [abs(c) for t in law.characteristic(model) for c in t.time_constants]
-    shortest = min([c for c in (*constants, model.dead_time) if c > 0.0], default=1.0)
-    return float(law.from_setpoint(np.array([1e9 / shortest], dtype=np.complex128))[0].real)
+    def process(self, s: ComplexArray) -> ComplexArray:
+        """Return the process as the law meets it, y/u.
 
+        :param s: rad/s, shape (n,).
+        """
+        return np.asarray(self._process(s)[:, 0])
 
-def integral_gain(law: ControlLaw, frequency: float) -> float:
-    """Return the limit of ``s C(s)`` for s -> 0, 0 without integral action [u/(y s)].
+    def __call__(self, s: ComplexArray) -> ComplexArray:
+        """Return L.
 
-    :param law: the controller.
-    :param frequency: about which the loop is closed [rad/s].
-    """
-    s = frequency * np.array([1e-6, 2e-6], dtype=np.complex128)
-    once, twice = (s * law(s)).real
-    gain = float(2.0 * once - twice)
-    proportional = abs(complex(law(np.array([1j * frequency]))[0]))
-    return gain if abs(gain) > 1e-9 * frequency * proportional else 0.0
+        :param s: rad/s, shape (n,).
+        """
+        return np.asarray(self.law(s) * self.process(s))
 
+    @cached_property
+    def grid(self) -> FloatArray:
+        """Frequencies that show the loop [rad/s], shape (n,)."""
+        return frequencies(self.model, times=self.law.times, period=self.law.period, loop=self)
 
-def horizon(law: ControlLaw, model: TransferFunction, frequency: float) -> float:
-    """Return a first guess of how long the responses last [s].
+    @cached_property
+    def unstable_poles(self) -> float:
+        """Number of unstable closed-loop poles; infinite: not certain, or one on the boundary.
 
-    :param law: the controller.
-    :param model: the process, with all dead time of the loop.
-    :param frequency: about which the loop is closed [rad/s].
-    """
-    integral = abs(integral_gain(law, frequency))
-    reset = max((abs(t) for t in model.time_constants), default=0.0)
-    if integral > 0.0:
-        reset = abs(complex(law(np.array([1j * frequency]))[0])) / integral
-        if model.is_stable:
-            # With a small gain, the integral alone brings the process to its set-point.
-            reset += 1.0 / (integral * abs(model.gain))
-    return _RESETS * reset + _TURNS * 2.0 * math.pi / frequency
+        :raises TuningError: if the process has undamped poles other than at s = 0.
+        """
+        if self.law.period == 0.0:
+            return closed_loop_unstable_poles(self.law.characteristic(self.model))
+        integrators = self.model.integrators + (1 if self.law.i else 0)
+        poles = int(self._process.unstable_poles[0])
+        return sampled_unstable_poles(self, self.grid, self.law.period, poles, integrators)
 
+    @cached_property
+    def _end(self) -> float:
+        """L at the highest frequency, half that of the samples; 0 of a continuous loop."""
+        if self.law.period == 0.0:
+            return 0.0
+        return float(self(np.array([1j * math.pi / self.law.period]))[0].real)
 
-def step_responses(
-    law: ControlLaw, model: TransferFunction, duration: float, points: int = _POINTS
-) -> tuple[StepResponse, StepResponse]:
-    """Return the responses to a unit step of the set-point, and to one of the load.
+    def ms(self) -> float:
+        """Return the largest magnitude of the sensitivity function.
 
-    :param law: the controller of a stable loop.
-    :param model: the process, with all dead time of the loop.
-    :param duration: s.
-    :param points: number of instants.
-    """
-    s = abscissae(duration, points)
-    # All four responses follow from these three functions at the same frequencies.
-    g, c, f = model(s), law(s), law.from_setpoint(s)
-    rest = 1.0 + c * g
-    time = np.arange(points) * (duration / points)
+        :return: infinite where the loop is unstable, or where that could not be decided.
+        """
+        try:
+            if self.unstable_poles != 0:
+                return math.inf
+        except RelayAutotuneError:
+            return math.inf
+        return max(sensitivity_peaks(self, self.grid)[0], 1.0 / abs(1.0 + self._end))
 
-    def step(values: ComplexArray, jump: float = 0.0) -> FloatArray:
-        return inverted(values / s, duration, jump)
+    def margins(self) -> LoopMargins:
+        """Return the margins of the loop, which must be stable.
 
-    return (
-        StepResponse(time, step(g / rest * f), step(f / rest, _first_command(law, model))),
-        StepResponse(time, step(g / rest), step(-c * g / rest)),
-    )
+        The delay margin is the phase margin over its frequency, also of a sampled loop.
+        """
+        at_rest = None
+        if self.model.integrators == 0 and not self.law.i:
+            at_rest = float(self.law(np.zeros(1, dtype=np.complex128))[0].real) * self.model.gain
+        found, end = margins(self, self.grid, at_rest), self._end
+        more = {"mt": max(found.mt, abs(end / (1.0 + end)))}
+        if 1.0 / abs(1.0 + end) > found.ms:
+            more |= {"ms": 1.0 / abs(1.0 + end), "ms_frequency": math.pi / self.law.period}
+        if end < -1.0:
+            more["gain_margin_low"] = max(found.gain_margin_low, -1.0 / end)
+        elif end < 0.0:
+            more["gain_margin"] = min(found.gain_margin, -1.0 / end)
+        return replace(found, **more)
 
+    def noise_gain(self) -> float:
+        """Return the standard deviation of the command per that of white noise [u/y].
 
-def step_figures(law: ControlLaw, model: TransferFunction, frequency: float) -> StepFigures:
-    """Return the features of the responses to unit steps.
+        Of a continuous loop it is the largest magnitude from noise to command, an upper bound for
+        every period.
+        """
+        if self.law.period == 0.0:
+            s = 1j * self.grid
+            return float(np.abs(self.law(s) / (1.0 + self(s))).max())
+        s = 1j * (np.arange(_ANGLES) + 0.5) * (math.pi / _ANGLES / self.law.period)
+        return float(np.sqrt(np.mean(np.abs(self.law(s) / (1.0 + self(s))) ** 2)))
 
-    :param law: the controller of a stable loop.
-    :param model: the process, with all dead time of the loop.
-    :param frequency: about which the loop is closed [rad/s].
-    :raises TuningError: if the responses do not die away in any reasonable time.
-    """
-    rest = np.array([1e-9 * frequency], dtype=np.complex128)
-    to_load = measurement_from_load(law, model, rest)
-    to_setpoint = to_load * law.from_setpoint(rest)
-    integral = integral_gain(law, frequency)
-    final, offset = 1.0, 0.0
-    if integral == 0.0:
-        final, offset = float(to_setpoint[0].real), float(to_load[0].real)
-    duration = horizon(law, model, frequency)
-    # Twenty instants per period of this frequency, if the number of points allows it.
-    finest = min(int(20.0 * duration * frequency / (2.0 * math.pi)), _MOST_POINTS // 8)
-    points = max(_POINTS, 1 << finest.bit_length())
-    longest = LONGEST * duration
-    while True:
-        setpoint, load = step_responses(law, model, duration, points)
-        tails = (setpoint.measurement - final, load.measurement - offset)
-        if all(has_settled(tail) for tail in tails):
-            break
-        duration, points = 2.0 * duration, min(2 * points, _MOST_POINTS)
-        if duration > longest:
+    def step_responses(
+        self, duration: float, points: int = _POINTS
+    ) -> tuple[StepResponse, StepResponse]:
+        """Return the responses to a unit step of the set-point, and to one of the load.
+
+        The loop must be stable. The command just after a step of the set-point lacks what the
+        derivative of the error adds to a few samples, unless the instants are the samples.
+
+        :param duration: s.
+        :param points: number of instants.
+        """
+        sampled = self._has_instants(duration, points)
+        s = abscissae(duration, points)
+        y_r, y_d, u_r, u_d = self._closed(s, sampled)
+        step = self._unit_step(s, sampled)
+        time = np.arange(points) * (duration / points)
+
+        def inverse(values: ComplexArray, jump: float = 0.0) -> FloatArray:
+            return inverted(values * step, duration, jump, sampled=sampled)
+
+        if not sampled:
+            u_r = u_r - self._kick(s)
+        return (
+            StepResponse(time, inverse(y_r), inverse(u_r, self._first_command(kick=False))),
+            StepResponse(time, inverse(y_d), inverse(u_d)),
+        )
+
+    def _has_instants(self, duration: float, points: int) -> bool:
+        """Return whether equally spaced instants are those of the samples."""
+        return math.isclose(duration, points * self.law.period, rel_tol=1e-9)
+
+    def _unit_step(self, s: ComplexArray, sampled: bool) -> ComplexArray:
+        h = self.law.period
+        return h / -np.expm1(-s * h) if sampled else 1.0 / s
+
+    def _closed(self, s: ComplexArray, sampled: bool) -> tuple[ComplexArray, ...]:
+        """Return measurement and command from set-point and load: y/r, y/d, u/r, u/d.
+
+        :param sampled: True: the measurement at the samples; False: between them as well.
+        """
+        held = self.process(s)
+        process = held if sampled else self.model(s)
+        law, forward = self.law(s), self.law.from_setpoint(s)
+        rest = 1.0 + law * held
+        return process * forward / rest, process / rest, forward / rest, -law * held / rest
+
+    def _kick(self, s: ComplexArray) -> ComplexArray:
+        """Return command per set-point by the derivative of the error alone."""
+        return self.law.kick(s) if isinstance(self.law, SampledLaw) else 0.0 * s
+
+    def _first_command(self, *, kick: bool = True) -> float:
+        """Return the command just after a unit step of the set-point [u]."""
+        constants = (*self.model.time_constants, *self.law.times, self.law.period)
+        shortest = min([abs(c) for c in constants if c != 0.0], default=1.0)
+        s = np.array([1e9 / shortest], dtype=np.complex128)
+        first = self.law.from_setpoint(s) - (0.0 if kick else self._kick(s))
+        return float(first[0].real)
+
+    def figures(self, frequency: float) -> StepFigures:
+        """Return the features of the responses to unit steps; the loop must be stable.
+
+        :param frequency: about which the loop is closed [rad/s].
+        :raises TuningError: if the responses do not die away in any reasonable time.
+        """
+        duration, h = self._horizon(frequency), self.law.period
+        longest = _LONGEST * duration
+        # Twenty instants per period of this frequency, if the number of points allows it.
+        finest = min(int(20.0 * duration * frequency / (2.0 * math.pi)), _MOST_POINTS // 8)
+        points = max(_POINTS, 1 << finest.bit_length())
+        while True:
+            if h > 0.0 and duration <= _MOST_SAMPLES * h:
+                samples = max(_LEAST_SAMPLES, 1 << int(duration / h).bit_length())
+                setpoint, load = self.step_responses(samples * h, samples)
+            else:
+                setpoint, load = self.step_responses(duration, points)
+            final, offset, integrals = self._at_rest(frequency, setpoint)
+            tails = (setpoint.measurement - final, load.measurement - offset)
+            if all(_has_settled(tail) for tail in tails):
+                break
+            duration, points = 2.0 * duration, min(2 * points, _MOST_POINTS)
+            if duration > longest:
+                raise TuningError(
+                    "the responses of the closed loop do not die away in any reasonable time"
+                )
+        error, step = final - setpoint.measurement, float(setpoint.time[1])
+        iae_setpoint, iae_load = (
+            _iae(whole, e, step) if math.isfinite(whole) else math.inf
+            for whole, e in zip(integrals, (error, load.measurement), strict=True)
+        )
+        return StepFigures(
+            iae_load=iae_load,
+            iae_setpoint=iae_setpoint,
+            overshoot=max(float(np.max(-error / final)), 0.0),
+            settling_time=_settling_time(setpoint.time, error, BAND * abs(final)),
+            effort_setpoint=self._effort(setpoint),
+            effort_load=_variation(load.command),
+        )
+
+    def _at_rest(
+        self, frequency: float, setpoint: StepResponse
+    ) -> tuple[float, float, tuple[float, float]]:
+        """Return where both responses end, and the integrals of both errors [y s]."""
+        step = float(setpoint.time[1])
+        sampled = self._has_instants(step * setpoint.time.size, setpoint.time.size)
+        s = np.array([1e-8 * frequency], dtype=np.complex128)
+        to_setpoint, to_load, *_ = self._closed(s, sampled)
+        if self.law.i:
+            whole = float(((1.0 - to_setpoint) * self._unit_step(s, sampled))[0].real)
+            return 1.0, 0.0, (whole, 1.0 / self.law.i)
+        final = float(to_setpoint[0].real)
+        whole = 0.0 if abs(1.0 - final) < _NO_OFFSET else math.inf
+        return final, float(to_load[0].real), (whole, math.inf)
+
+    def _effort(self, setpoint: StepResponse) -> float:
+        """Return the total variation of the command after a unit step of the set-point."""
+        size, law, command = setpoint.time.size, self.law, setpoint.command
+        if self._has_instants(float(setpoint.time[1]) * size, size):
+            return abs(float(command[0])) + _variation(command)
+        added = law.kick_variation if isinstance(law, SampledLaw) else 0.0
+        return abs(self._first_command(kick=False)) + _variation(command) + added
+
+    def _horizon(self, frequency: float) -> float:
+        """Return a first guess of how long the responses last [s]."""
+        reset = max((abs(t) for t in self.model.time_constants), default=0.0)
+        integral = abs(self.law.i)
+        if integral > 0.0:
+            reset = abs(complex(self.law(np.array([1j * frequency]))[0])) / integral
+            if self.model.is_stable:
+                # With a small gain, the integral alone brings the process to its set-point.
+                reset += 1.0 / (integral * abs(self.model.gain))
+        return _RESETS * reset + _TURNS * 2.0 * math.pi / frequency
+
+    def performance(self) -> Performance:
+        """Return what the loop does.
+
+        :raises TuningError: if it is unstable, or its responses do not die away.
+        """
+        if self.unstable_poles != 0:
+            law = self.law
+            how = ""
+            if isinstance(law, SampledLaw):
+                how = f" where {law.law.name} runs it every {law.period:g} s" if law.period else ""
+                law = law.gains
+            shorter = ", or a shorter sample_period" if how else ""
             raise TuningError(
-                "the responses of the closed loop do not die away in any reasonable time"
+                f"{law} makes an unstable loop with the model{how}: use another rule{shorter}"
             )
-    iae_load = 1.0 / integral if integral else math.inf
-    iae_setpoint = math.inf
-    if abs(1.0 - final) < NO_OFFSET:
-        iae_setpoint = float(((1.0 - to_setpoint) / rest)[0].real)
-    first = abs(_first_command(law, model))
-    return figures_of(setpoint, load, final, (iae_setpoint, iae_load), first)
+        found = vars(self.margins()).copy()
+        figures = self.figures(found.pop("ms_frequency"))
+        return Performance(**found, **vars(figures), noise_gain=self.noise_gain())
 
 
-def figures_of(
-    setpoint: StepResponse,
-    load: StepResponse,
-    final: float,
-    integrals: tuple[float, float],
-    first_command: float,
-) -> StepFigures:
-    """Return the features of responses that have settled.
-
-    :param setpoint: to a unit step of the set-point.
-    :param load: to a unit step of the load.
-    :param final: measurement at the end of the first.
-    :param integrals: of the error after each [y s]; infinite where an error remains.
-    :param first_command: size of the command's own jump at the step of the set-point [u].
-    """
-    error = final - setpoint.measurement
-    step = float(setpoint.time[1])
-    iae_setpoint, iae_load = (
-        _iae(whole, e, step) if math.isfinite(whole) else math.inf
-        for whole, e in zip(integrals, (error, load.measurement), strict=True)
-    )
-    return StepFigures(
-        iae_load=iae_load,
-        iae_setpoint=iae_setpoint,
-        overshoot=max(float(np.max(-error / final)), 0.0),
-        settling_time=_settling_time(setpoint.time, error, BAND * abs(final)),
-        effort_setpoint=first_command + _variation(setpoint.command),
-        effort_load=_variation(load.command),
-    )
-
-
-def has_settled(tail: FloatArray) -> bool:
+def _has_settled(tail: FloatArray) -> bool:
     """Return True if the late part of a deviation is negligible, shape (n,)."""
     late = tail[3 * tail.size // 4 : -tail.size // 16]
     return float(np.abs(late).max()) <= _SETTLED * float(np.abs(tail).max())
@@ -260,114 +385,7 @@ def _iae(whole: float, error: FloatArray, step: float) -> float:
     return abs(whole) + 2.0 * float(other.sum()) * step
 
 
-_ANGLES = 2048
-
-# Grid of filter time constant over sampling period, for interpolation.
-_RATIOS = np.geomspace(1e-3, 1e4, 141)
-
-
-@lru_cache(maxsize=1)
-def _moments() -> FloatArray:
-    """Return var(yf), cov(yf, h yf') and var(h yf') for each of ``_RATIOS``, shape (3, n)."""
-    motions = [filter_matrices(float(ratio), 1.0) for ratio in _RATIOS]
-    turn, past, present = (np.array(part) for part in zip(*motions, strict=True))
-    # Scaled to the filter's time constant, both states have one order of magnitude.
-    size = np.stack((np.ones(_RATIOS.size), _RATIOS), axis=1)
-    turn, past, present = turn * size[:, :, None] / size[:, None, :], past * size, present * size
-    # State and next sample are correlated only by the sample before.
-    shared = _outer((turn @ present[..., None])[..., 0], past)
-    drive = _outer(past, past) + _outer(present, present) + shared + shared.swapaxes(1, 2)
-    twice = turn[:, :, None, :, None] * turn[:, None, :, None, :]
-    operator = np.eye(4) - twice.reshape(-1, 4, 4)
-    covariance = np.linalg.solve(operator, drive.reshape(-1, 4, 1))
-    return covariance[:, [0, 1, 3], 0].T / np.stack((size[:, 0], _RATIOS, _RATIOS**2))
-
-
-def _outer(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the outer products of vectors, shape (n, 2, 2)."""
-    return np.asarray(left[:, :, None] * right[:, None, :])
-
-
-def open_noise_gain(td: FloatArray, tf: FloatArray, period: float) -> FloatArray:
-    """Return the standard deviation of ``yf + td dyf/dt`` per that of white sampled noise.
-
-    Multiplied by kc it is the standard deviation of the command, without the integral part and
-    without feedback through the loop.
-
-    :param td: derivative times [s], shape (k,).
-    :param tf: time constants of the filter [s], shape (k,).
-    :param period: period of the samples [s].
-    """
-    at = np.log(np.maximum(tf / period, _RATIOS[0]))
-    value, mixed, slope = (np.interp(at, np.log(_RATIOS), row) for row in _moments())
-    lead = td / period
-    return np.sqrt(value + 2.0 * lead * mixed + lead**2 * slope)
-
-
-def filter_for(td: FloatArray, largest: FloatArray, period: float) -> FloatArray:
-    """Return the least time constant of the filter that keeps the noise gain within a limit.
-
-    :param td: derivative times [s], shape (k,).
-    :param largest: largest allowed :func:`open_noise_gain`, shape (k,).
-    :param period: period of the samples [s].
-    :return: s, shape (k,); infinite: no usable time constant is enough.
-    """
-    value, mixed, slope = _moments()
-    lead = (td / period)[:, None]
-    gains = np.sqrt(value + 2.0 * lead * mixed + lead**2 * slope)
-    # Beyond some time constant the noise gain only falls.
-    keeps = gains <= largest[:, None]
-    first = np.where(keeps.any(axis=1), keeps.argmax(axis=1), _RATIOS.size)
-    inside = np.clip(first, 1, _RATIOS.size - 1)
-    rows = np.arange(td.size)
-    above, below = np.log(gains[rows, inside - 1]), np.log(gains[rows, inside])
-    share = np.clip((above - np.log(largest)) / np.maximum(above - below, 1e-300), 0.0, 1.0)
-    steps = np.log(_RATIOS)
-    found = np.exp(steps[inside - 1] + share * (steps[inside] - steps[inside - 1])) * period
-    found = np.where(first == 0, 0.0, found)
-    return np.where(first == _RATIOS.size, math.inf, found)
-
-
-def noise_gain(controller: ControlLaw, model: TransferFunction, period: float) -> float:
-    """Return the standard deviation of the command per that of white measurement noise.
-
-    The noise of the samples reaches the command directly and around the loop, in which the command
-    is held for a period. A PI or PID controller is computed as
-    :class:`~relay_autotune.loop.sampled.SampledPid` runs it.
-
-    :param controller: the controller of a stable loop.
-    :param model: the process, with all dead time of the loop, that of the hold included.
-    :param period: period of the samples [s]; 0: the largest magnitude from noise to command, an
-        upper bound for every period.
-    :return: u/y.
-    """
-    if period == 0.0:
-        grid = frequencies(*controller.characteristic(model))
-        s = 1j * grid
-        return float(np.abs(controller(s) / (1.0 + controller(s) * model(s))).max())
-    angle = (np.arange(_ANGLES) + 0.5) * (math.pi / _ANGLES)
-    s = 1j * angle / period
-    sampled = _sampled(controller, angle, period)
-    held = model(s) * np.sinc(angle / (2.0 * math.pi))
-    return float(np.sqrt(np.mean(np.abs(sampled / (1.0 + sampled * held)) ** 2)))
-
-
-def _sampled(controller: ControlLaw, angle: FloatArray, period: float) -> ComplexArray:
-    if not isinstance(controller, Controller):
-        return controller(1j * angle / period)
-    turn, past, present = filter_matrices(controller.tf, period)
-    z = np.exp(1j * angle)
-    # Transform of the state, by Cramer's rule.
-    first, second = (past[k] + present[k] * z for k in (0, 1))
-    (f11, f12), (f21, f22) = turn.tolist()
-    determinant = (z - f11) * (z - f22) - f12 * f21
-    value = ((z - f22) * first + f12 * second) / determinant
-    slope = ((z - f11) * second + f21 * first) / determinant
-    integral = controller.i * period * z / (z - 1.0)
-    return np.asarray(controller.kc * (value + controller.td * slope) + integral * value)
-
-
-__all__ = ["analyse_loop", "frequencies", "is_stable", "ms_on", "sensitivity_peaks"]
+__all__ = ["Loop", "analyse_loop", "frequencies", "is_stable", "ms_on", "sensitivity_peaks"]
 
 
 def is_stable(controller: ControlLaw, model: TransferFunction) -> bool:
@@ -376,7 +394,7 @@ def is_stable(controller: ControlLaw, model: TransferFunction) -> bool:
     :param controller: the gains, or any other linear controller.
     :param model: the process.
     """
-    return closed_loop_unstable_poles(controller.characteristic(model)) == 0
+    return Loop(controller, model).unstable_poles == 0
 
 
 def analyse_loop(
@@ -385,28 +403,13 @@ def analyse_loop(
     """Return the performance of a controller on a model.
 
     :param controller: the gains, or any other linear controller.
-    :param model: the process, with all dead time of the loop.
-    :param sample_period: period of the measurement, for its noise [s]; 0: continuous.
+    :param model: the process, with all dead time of the loop but that of the hold.
+    :param sample_period: at which controller_node runs the gains [s]; 0: continuous.
     :raises TuningError: if the closed loop is unstable, or its responses do not die away.
     """
-    if not is_stable(controller, model):
-        raise TuningError(f"{controller} makes an unstable loop with the model: use another rule")
-    terms = controller.characteristic(model)
-    found = margins(lambda s: controller(s) * model(s), frequencies(*terms), _at_rest(terms))
-    figures = step_figures(controller, model, found.ms_frequency)
-    noise = noise_gain(controller, model, sample_period)
-    return performance_of(found, figures, noise)
-
-
-def performance_of(found: LoopMargins, figures: StepFigures, noise: float) -> Performance:
-    """Join what was found of a loop.
-
-    :param found: its margins.
-    :param figures: of its responses.
-    :param noise: gain from noise to command [u/y].
-    """
-    known = {name: value for name, value in vars(found).items() if name != "ms_frequency"}
-    return Performance(**known, **vars(figures), noise_gain=noise)
+    if sample_period > 0.0 and isinstance(controller, Controller):
+        controller = LAWS[OWN_LAW].at(controller, sample_period)
+    return Loop(controller, model).performance()
 
 
 def ms_on(controller: ControlLaw, model: TransferFunction) -> float:
@@ -415,18 +418,4 @@ def ms_on(controller: ControlLaw, model: TransferFunction) -> float:
     :param controller: the gains, or any other linear controller.
     :param model: the process, with all dead time of the loop.
     """
-    try:
-        if not is_stable(controller, model):
-            return math.inf
-    except RelayAutotuneError:
-        # Stability could not be decided; count it as unstable.
-        return math.inf
-    grid = frequencies(*controller.characteristic(model))
-    return sensitivity_peaks(lambda s: controller(s) * model(s), grid)[0]
-
-
-def _at_rest(terms: tuple[TransferFunction, ...]) -> float | None:
-    """Return the loop's gain at s = 0, for a single term without integral action; else None."""
-    if len(terms) != 1 or terms[0].integrators != 0:
-        return None
-    return terms[0].gain
+    return Loop(controller, model).ms()

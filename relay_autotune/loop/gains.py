@@ -78,6 +78,16 @@ class Controller:
         return self.kc * self.td
 
     @property
+    def period(self) -> float:
+        """Sampling period: 0, that of a continuous controller [s]."""
+        return 0.0
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Times at which it changes its effect [s]."""
+        return (self.ti, self.td, self.tf)
+
+    @property
     def tracking(self) -> float:
         """Time in which back-calculation draws the integral to a limit, sqrt(ti td) [s].
 
@@ -243,6 +253,18 @@ class Gains(Performance, Controller):
 class ControlLaw(Protocol):
     """A linear controller, as :class:`~relay_autotune.loop.gains.Controller` is."""
 
+    @property
+    def period(self) -> float:
+        """Sampling period [s]; 0: continuous."""
+
+    @property
+    def i(self) -> float:
+        """Integral gain, the limit of ``s C(s)`` for s -> 0 [u/(y s)]."""
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Times at which it changes its effect [s]."""
+
     def __call__(self, s: ComplexArray) -> ComplexArray:
         """Return -command per measurement at complex frequencies [u/y]."""
 
@@ -267,6 +289,27 @@ class InternalModelLaw:
 
     forward: TransferFunction
     inside: TransferFunction
+
+    @property
+    def period(self) -> float:
+        """Sampling period: 0, that of a continuous controller [s]."""
+        return 0.0
+
+    @property
+    def i(self) -> float:
+        """Integral gain [u/(y s)]."""
+        inside = self.inside
+        if inside.gain != 1.0 or inside.integrators:
+            return 0.0
+        lag = sum(inside.time_constants) - sum(inside.zeros) + inside.dead_time
+        return float(self.forward.gain / complex(lag).real)
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Times at which it changes its effect [s]."""
+        terms = (self.forward, self.inside)
+        constants = [c for t in terms for c in (*t.zeros, *t.time_constants)]
+        return (*(abs(c) for c in constants), self.inside.dead_time)
 
     def __call__(self, s: ComplexArray) -> ComplexArray:
         """Return -command per measurement at complex frequencies [u/y].

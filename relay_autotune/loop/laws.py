@@ -19,46 +19,66 @@ import enum
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from relay_autotune.arrays import ComplexArray
+from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.sampled import UNLIMITED, Limits, filter_matrices, require_period
+from relay_autotune.loop.sampled import (
+    UNLIMITED,
+    Limits,
+    filter_elements,
+    has_filter,
+    require_period,
+    without_filter,
+)
+from relay_autotune.process.transfer_function import TransferFunction
 
 # Largest excess of a weight that counts as the same.
 _SAME_WEIGHT = 0.005
+
+
+# A time constant, or one for each of k functions, shape (k, 1).
+Time = Any
 
 
 @dataclass(frozen=True)
 class Rational:
     """A rational function of z, in powers of ``z^-1``.
 
-    :param top: coefficients of 1, z^-1, z^-2 and so on.
-    :param bottom: likewise; the first one is 1.
+    Coefficients of shape (k, 1) are those of k functions at once.
+
+    :param top: coefficients of 1, z^-n, z^-2n and so on.
+    :param bottom: coefficients of 1, z^-1, z^-2 and so on; the first one is 1.
+    :param apart: n, above 1 for a long memory.
     """
 
-    top: tuple[float, ...]
-    bottom: tuple[float, ...] = (1.0,)
+    top: tuple[Any, ...]
+    bottom: tuple[Any, ...] = (1.0,)
+    apart: Any = 1
 
-    def __call__(self, z: ComplexArray) -> ComplexArray:
-        """Return the value at each z, any shape."""
-        back = 1.0 / z
-        above, below = (
-            np.polynomial.polynomial.polyval(back, part) for part in (self.top, self.bottom)
-        )
-        return np.asarray(above / below)
-
-    def __mul__(self, other: Rational) -> Rational:
-        return Rational(
-            tuple(np.convolve(self.top, other.top).tolist()),
-            tuple(np.convolve(self.bottom, other.bottom).tolist()),
-        )
+    def __call__(self, back: ComplexArray) -> ComplexArray:
+        """Return the value at each ``z^-1``, of any shape; of k functions at (n,): (k, n)."""
+        far = back**self.apart
+        return np.asarray(polynomial(self.top, far) / polynomial(self.bottom, back))
 
     def times(self, factor: float) -> Rational:
         """Return the function times a number."""
-        return Rational(tuple(factor * c for c in self.top), self.bottom)
+        return replace(self, top=tuple(factor * c for c in self.top))
+
+
+def polynomial(coefficients: tuple[Any, ...], x: ComplexArray) -> Any:
+    """Return a polynomial's values.
+
+    :param coefficients: lowest power first, each a number, or of k polynomials shape (k, 1).
+    :param x: any shape; of k polynomials (n,).
+    """
+    found = coefficients[-1]
+    for c in coefficients[-2::-1]:
+        found = c + x * found
+    return found
 
 
 _ONE = Rational((1.0,))
@@ -70,17 +90,37 @@ class _Running:
 
     def __init__(self, function: Rational) -> None:
         self._function = function
-        self._inputs = [0.0] * len(function.top)
+        self._inputs = [0.0] * (1 + int(function.apart) * (len(function.top) - 1))
         self._outputs = [0.0] * (len(function.bottom) - 1)
 
     def step(self, value: float) -> float:
         self._inputs = [value, *self._inputs[:-1]]
-        found = sum(b * x for b, x in zip(self._function.top, self._inputs, strict=True))
+        heard = self._inputs[:: int(self._function.apart)]
+        found = sum(b * x for b, x in zip(self._function.top, heard, strict=True))
         past = zip(self._function.bottom[1:], self._outputs, strict=True)
         found -= sum(a * y for a, y in past)
         if self._outputs:
             self._outputs = [found, *self._outputs[:-1]]
         return found
+
+
+# The response of a filter to an impulse has ended after so many time constants.
+_SETTLED = 12.0
+
+
+def taps_of(function: Rational, tf: float, period: float) -> FloatArray:
+    """Return the response to an impulse, until it has died away, shape (n,).
+
+    :param function: of at most the first order.
+    :param tf: its time constant [s].
+    :param period: of the samples [s].
+    """
+    taps = np.zeros(1 + int(function.apart) * (len(function.top) - 1))
+    taps[:: int(function.apart)] = function.top
+    if len(function.bottom) > 1:
+        decay = (-function.bottom[1]) ** np.arange(int(_SETTLED * tf / period) + 2)
+        taps = np.convolve(taps, decay)[: decay.size]
+    return taps
 
 
 class Integral(enum.Enum):
@@ -122,7 +162,7 @@ class Smoothing:
 
     :param words: its description in the guide.
     :param setting: the time constant that it has, from the one that is wanted and the period [s].
-    :param slope: the derivative of a signal, for its own time constant and the period.
+    :param slope: the derivative of a signal, for its own time constants and the period.
     :param value: the filter on the measurement in the other parts; likewise.
     :param adjustable: True if the time constant can be chosen.
     :param on_measurement: True if all parts see the measurement through the filter.
@@ -130,42 +170,45 @@ class Smoothing:
 
     words: str
     setting: Callable[[float, float], float]
-    slope: Callable[[float, float], Rational]
-    value: Callable[[float, float], Rational] = lambda _tf, _period: _ONE
+    slope: Callable[[Time, float], Rational]
+    value: Callable[[Time, float], Rational] = lambda _tf, _period: _ONE
     adjustable: bool = True
     on_measurement: bool = False
 
 
-def _measurement_filter(tf: float, period: float) -> tuple[Rational, Rational]:
+def _measurement_filter(tf: Time, period: float) -> tuple[Rational, Rational]:
     """Return value and slope of the second-order filter of controller_node."""
-    turn, past, present = filter_matrices(tf, period)
-    (f11, f12), (f21, f22) = turn.tolist()
+    used = has_filter(np.asarray(tf), period)
+    found = filter_elements(np.where(used, tf, period), period, np)
+    f11, f12, f21, f22, p1, p2, n1, n2 = (
+        np.where(used, with_it, none)
+        for with_it, none in zip(found, without_filter(period), strict=True)
+    )
     bottom = (1.0, -(f11 + f22), f11 * f22 - f12 * f21)
-    (p1, p2), (n1, n2) = past.tolist(), present.tolist()
     value = (n1, p1 - f22 * n1 + f12 * n2, f12 * p2 - f22 * p1)
     slope = (n2, p2 - f11 * n2 + f21 * n1, f21 * p1 - f11 * p2)
     return Rational(value, bottom), Rational(slope, bottom)
 
 
-def _first_order(tf: float, period: float) -> Rational:
+def _first_order(tf: Time, period: float) -> Rational:
     """Return ``d_k = (1 - a) d_{k-1} + a (y_k - y_{k-1})/h`` with ``a = h/tf``."""
-    a = period / max(tf, period)
+    a = period / np.maximum(tf, period)
     return Rational((a / period, -a / period), (1.0, a - 1.0))
 
 
-def averaged_over(tf: float, period: float) -> int:
+def averaged_over(tf: Time, period: float) -> Any:
     """Return the number of differences whose mean lags ``tf`` more than one difference.
 
     :param tf: s.
     :param period: of the samples [s].
     """
-    return 1 + round(2.0 * tf / period)
+    return 1 + np.rint(2.0 * np.asarray(tf) / period).astype(int)
 
 
-def _mean(tf: float, period: float) -> Rational:
+def _mean(tf: Time, period: float) -> Rational:
     count = averaged_over(tf, period)
-    last = -1.0 / (count * period)
-    return Rational((-last, *[0.0] * (count - 1), last))
+    last = 1.0 / (count * period)
+    return Rational((last, -last), (1.0,), count)
 
 
 _PLAIN = Smoothing(
@@ -302,7 +345,6 @@ class Law:
         :param period: of the samples [s].
         :raises TuningError: if it cannot run gains of this sign, or without integral action.
         """
-        require_period(period)
         if self.only_positive and wanted.kc < 0.0:
             raise TuningError(
                 f"{self.name} takes positive gains only, found kc = {wanted.kc:g}: a higher "
@@ -339,14 +381,27 @@ class Law:
 class SampledLaw:
     """A law with its gains, at its sampling period.
 
+    It is a linear controller as a function of s, on which ``z = exp(s h)``. Of controller_node's
+    law there is the limit for h -> 0 as well, the continuous controller.
+
     :param law: the law.
     :param gains: its gains, in the ISA form.
-    :param period: of the samples [s].
+    :param period: h [s]; 0: the continuous limit.
     """
 
     law: Law
     gains: Controller
     period: float
+
+    @property
+    def i(self) -> float:
+        """Integral gain [u/(y s)]."""
+        return self.gains.i
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Times at which it changes its effect [s]."""
+        return self.gains.times
 
     @property
     def value(self) -> Rational:
@@ -367,23 +422,49 @@ class SampledLaw:
             return _NOTHING
         return self.law.smoothing.slope(self.gains.tf, self.period).times(self.gains.d)
 
-    def from_measurement(self, z: ComplexArray) -> ComplexArray:
-        """Return -command per measurement, with the law's delay [u/y].
+    def __call__(self, s: ComplexArray) -> ComplexArray:
+        """Return -command per measurement at ``z = exp(s h)``, with the law's delay [u/y].
 
-        :param z: any shape.
+        :param s: rad/s, any shape.
         """
-        through = (self.gains.kc + self.integral(z)) * self.value(z) + self.derivative(z)
-        return np.asarray(through * z ** float(-self.law.delay))
+        if self.period == 0.0:
+            return self.gains(s)
+        back = np.exp(-np.asarray(s) * self.period)
+        through = (self.gains.kc + self.integral(back)) * self.value(back) + self.derivative(back)
+        return np.asarray(through * back**self.law.delay)
 
-    def from_setpoint(self, z: ComplexArray) -> ComplexArray:
-        """Return command per set-point, with the law's delay [u/y].
+    def from_setpoint(self, s: ComplexArray) -> ComplexArray:
+        """Return command per set-point at ``z = exp(s h)``, with the law's delay [u/y].
 
-        :param z: any shape.
+        :param s: rad/s, any shape.
         """
-        through = self.gains.kc * self.gains.b + self.integral(z)
-        if self.law.slope is Slope.ERROR:
-            through = through + self.derivative(z)
-        return np.asarray(through * z ** float(-self.law.delay))
+        if self.period == 0.0:
+            return self.gains.from_setpoint(s)
+        back = np.exp(-np.asarray(s) * self.period)
+        through = self.gains.kc * self.gains.b + self.integral(back)
+        return np.asarray(through * back**self.law.delay) + self.kick(s)
+
+    def kick(self, s: ComplexArray) -> ComplexArray:
+        """Return the part of :meth:`from_setpoint` that the derivative of the error brings.
+
+        :param s: rad/s, any shape.
+        """
+        if self.law.slope is not Slope.ERROR:
+            return 0.0 * np.asarray(s)
+        back = np.exp(-np.asarray(s) * self.period)
+        return np.asarray(self.derivative(back) * back**self.law.delay)
+
+    @property
+    def kick_variation(self) -> float:
+        """Total variation of the command by the derivative of the error after a unit step."""
+        if self.law.slope is not Slope.ERROR or self.gains.td == 0.0:
+            return 0.0
+        taps = np.array(taps_of(self.derivative, self.gains.tf, self.period))
+        return float(np.abs(np.diff(taps, prepend=0.0, append=0.0)).sum())
+
+    def characteristic(self, model: TransferFunction) -> tuple[TransferFunction, ...]:
+        """Return the terms L_k of the characteristic equation of the continuous loop."""
+        return self.gains.characteristic(model)
 
     def running(self) -> RunningLaw:
         """Return the law as it runs, from rest."""
@@ -452,7 +533,7 @@ class LawRate:
     """A law, and how often a program runs it.
 
     :param law: the law.
-    :param period: of its runs [s].
+    :param period: of its runs [s]; 0: continuously, which controller_node's law alone can be.
     :raises TuningError: if the period is not positive and finite.
     """
 
@@ -460,7 +541,8 @@ class LawRate:
     period: float
 
     def __post_init__(self) -> None:
-        require_period(self.period)
+        if self.period != 0.0 or self.law.name != OWN_LAW:
+            require_period(self.period)
 
     def of(self, gains: Controller) -> SampledLaw:
         """Return the law with gains, those parts left out that it lacks.
@@ -759,3 +841,5 @@ void startController() {
 
 OWN_LAW = _ROWS[0].name
 LAWS: dict[str, Law] = {law.name: law for law in _ROWS}
+# The limit of controller_node's law for a sampling period of 0.
+CONTINUOUS = LawRate(LAWS[OWN_LAW], 0.0)

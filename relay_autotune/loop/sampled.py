@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from types import ModuleType
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -71,6 +72,42 @@ class SampledController(Protocol):
         """Return the command for this sample [u]."""
 
 
+def filter_elements(tf: Any, period: float, of: ModuleType = math) -> tuple[Any, ...]:
+    """Return the elements of :func:`filter_matrices`: those of F by rows, of g0, of g1.
+
+    :param tf: time constants of the filter, positive [s]; a number, or any shape with numpy.
+    :param period: s.
+    :param of: where the functions are, ``math`` or ``numpy``.
+    """
+    # The poles lie at (-1 +- j)/tf, and a is the period in time constants. The closed form is
+    # faster than a matrix exponential with BLAS, whose threads need time to synchronise.
+    a = period / tf
+    decay, cosine, sine = of.exp(-a), of.cos(a), of.sin(a)
+    late, away = of.expm1(-a), 2.0 * of.sin(0.5 * a) ** 2
+    turn = (cosine + sine, tf * sine, -2.0 / tf * sine, cosine - sine)
+    step = (away - sine - late * (cosine + sine), 2.0 / tf * decay * sine)
+    # Response to a measurement that rises from 0 to 1 within the period.
+    ramp = (1.0 + (late * cosine - away) / a, step[0] / period)
+    return (*(decay * t for t in turn), step[0] - ramp[0], step[1] - ramp[1], *ramp)
+
+
+def without_filter(period: float) -> tuple[float, ...]:
+    """Return what :func:`filter_elements` gives as tf goes to 0.
+
+    :param period: s.
+    """
+    return (0.0, 0.0, 0.0, 0.0, 0.0, -1.0 / period, 1.0, 1.0 / period)
+
+
+def has_filter(tf: Any, period: float) -> Any:
+    """Return whether a time constant is long enough to be a filter at a period.
+
+    :param tf: s, any shape.
+    :param period: s.
+    """
+    return tf > 1e-6 * period
+
+
 def filter_matrices(tf: float, period: float) -> Motion:
     """Return the matrices that advance ``(yf, dyf/dt)`` by one period.
 
@@ -80,18 +117,9 @@ def filter_matrices(tf: float, period: float) -> Motion:
     :param period: s.
     :return: F of shape (2, 2), g0 and g1 of shape (2,).
     """
-    if tf <= 1e-6 * period:
-        return np.zeros((2, 2)), np.array([0.0, -1.0 / period]), np.array([1.0, 1.0 / period])
-    # The poles lie at (-1 +- j)/tf, and a is the period in time constants. The closed form is
-    # faster than a matrix exponential with BLAS, whose threads need time to synchronise.
-    a = period / tf
-    decay, cosine, sine = math.exp(-a), math.cos(a), math.sin(a)
-    late, away = math.expm1(-a), 2.0 * math.sin(0.5 * a) ** 2
-    turn = decay * np.array([[cosine + sine, tf * sine], [-2.0 / tf * sine, cosine - sine]])
-    step = np.array([away - sine - late * (cosine + sine), 2.0 / tf * decay * sine])
-    # Response to a measurement that rises from 0 to 1 within the period.
-    ramp = np.array([1.0 + (late * cosine - away) / a, step[0] / period])
-    return turn, step - ramp, ramp
+    used = has_filter(tf, period)
+    found = np.array(filter_elements(tf, period) if used else without_filter(period))
+    return found[:4].reshape(2, 2), found[4:6], found[6:]
 
 
 class PidLaw:

@@ -3,7 +3,8 @@
 
 """Stability of a closed loop and its margins: gain, phase, delay, peaks of the sensitivities.
 
-The number of poles in the right half plane comes from an exact argument principle.
+The number of poles in the right half plane comes from an exact argument principle; of a sampled
+loop, that of the poles outside the unit circle from its phase along the circle.
 
 The characteristic equation is ``1 + sum L_k(s) = 0``, each L_k rational with a dead time of its
 own. Where they have n poles at s = 0, all is multiplied by ``(a s/(1 + a s))^n``; the function H
@@ -26,7 +27,7 @@ is stable only if their magnitudes there have a sum below that of the rest (Bell
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,7 +71,12 @@ def closed_loop_unstable_poles(terms: Sequence[TransferFunction]) -> float:
 
 
 def winding(
-    values: ComplexArray, w: FloatArray, poles: IntArray, integrators: IntArray, limits: FloatArray
+    values: ComplexArray,
+    w: FloatArray,
+    poles: IntArray,
+    integrators: IntArray,
+    limits: FloatArray,
+    period: float = 0.0,
 ) -> FloatArray:
     """Return the same count for many loops from values on a grid; NaN if it is not certain.
 
@@ -82,16 +88,20 @@ def winding(
         one at which the loops have vanished.
     :param poles: number of poles of each L in the right half plane, shape (m,).
     :param integrators: number of integrators of each L, shape (m,).
-    :param limits: limit of each L for s -> infinity; 0 with a dead time, shape (m,).
+    :param limits: limit of each L for s -> infinity, 0 with a dead time; of sampled loops L at
+        half the sampling frequency, shape (m,).
+    :param period: of the samples [s]; 0: the loops are continuous.
     :return: shape (m,).
     """
-    s = 1j * w / math.sqrt(w[1] * w[-1])
-    risen = s / (1.0 + s)
-    bounded = np.empty((w.size + 1, poles.size), dtype=np.complex128)
-    bounded[-1] = 1.0 + limits
+    if period > 0.0:
+        risen = np.append(1.0 - np.exp(-1j * w * period), 2.0)
+    else:
+        s = 1j * w / math.sqrt(w[1] * w[-1])
+        risen = np.append(s / (1.0 + s), 1.0)
+    bounded = np.concatenate((values, 1.0 + limits[None]))
     for n in np.unique(integrators):
         of = integrators == n
-        bounded[:-1, of] = values[:, of] * (risen**n)[:, None]
+        bounded[:, of] *= (risen**n)[:, None]
     steps = bounded[1:] * bounded[:-1].conj()
     clear = np.all(np.abs(steps.imag) < _CLEAR * steps.real, axis=0)
     # With such short steps, each turn is one crossing of the negative real axis from above.
@@ -101,6 +111,45 @@ def winding(
     begins, ends = (np.arctan2(v.imag + 0.0, v.real) for v in (bounded[0], bounded[-1]))
     turns = np.rint((ends - begins) / math.pi + 2.0 * (falls - rises))
     return np.where(clear, poles - turns, math.nan)
+
+
+def sampled_unstable_poles(
+    loop: Loop, grid: FloatArray, period: float, poles: int, integrators: int
+) -> float:
+    """Return the number of closed-loop poles outside the unit circle.
+
+    The phase of 1 + L is followed along the circle; cells in which it turns too far are divided.
+
+    :param loop: L as a function of s, with ``z = exp(s h)``.
+    :param grid: frequencies up to half that of the samples [rad/s], shape (n,).
+    :param period: h [s].
+    :param poles: number of poles of L outside the circle.
+    :param integrators: number of integrators of L.
+    :return: infinite: not certain, or one on the circle.
+    """
+
+    def bounded(w: FloatArray) -> ComplexArray:
+        rise = 1.0 - np.exp(-1j * w * period)
+        return np.asarray((1.0 + loop(1j * w)) * rise ** float(integrators))
+
+    values = bounded(grid)
+    low, high, begins, ends = grid[:-1], grid[1:], values[:-1], values[1:]
+    total = 0.0
+    for _ in range(_MOST_DIVISIONS):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            turns = np.angle(ends / begins)
+        clear = np.abs(turns) < _FOLLOWED
+        total += float(turns[clear].sum())
+        low, high, begins, ends = low[~clear], high[~clear], begins[~clear], ends[~clear]
+        if not low.size:
+            return poles - round(total / math.pi)
+        if low.size > MOST_PIECES:
+            break
+        middle = 0.5 * (low + high)
+        between = bounded(middle)
+        low, high = np.concatenate((low, middle)), np.concatenate((middle, high))
+        begins, ends = np.concatenate((begins, between)), np.concatenate((between, ends))
+    return math.inf
 
 
 def at_infinity(term: TransferFunction) -> float:
@@ -257,8 +306,13 @@ _PEAKS = 4
 _ZOOMS, _ZOOM_POINTS = 9, 9
 # Number of rounds; each round divides a cell into this many parts.
 _ROUNDS, _PARTS = 13, 16
-# Below this magnitude the loop has no influence, whatever its phase.
-_FELT = 0.05
+# Below this magnitude the loop has no influence.
+_RELEVANT = 0.05
+_PER_DECADE = 50
+# Distance of a sampled loop's grid from half the sampling frequency, relative to it.
+_BEFORE_END = 1e-9
+# Largest step of the phase that can be followed, and largest number of divisions of a cell.
+_FOLLOWED, _MOST_DIVISIONS = 1.0, 40
 _MOST_TURNS = 800.0 * math.pi
 
 
@@ -272,30 +326,59 @@ class LoopMargins(Margins):
     ms_frequency: float
 
 
-def frequencies(*terms: TransferFunction) -> FloatArray:
+def frequencies(
+    *terms: TransferFunction,
+    times: Iterable[float] = (),
+    period: float = 0.0,
+    loop: Loop | None = None,
+) -> FloatArray:
     """Return a grid with little change of the loops' magnitude and phase between points.
 
+    Loops of one process have most of their grids in common, whatever their gains.
+
     :param terms: the loop, or the terms of its characteristic equation.
+    :param times: further times at which it changes, such as those of its controller [s].
+    :param period: of the samples: the grid ends before half their frequency [s]; 0: it ends above
+        all corners.
+    :param loop: what is followed, where that is more than the terms.
     :return: rad/s, increasing.
     """
     constants = [c for t in terms for c in (*t.zeros, *t.time_constants)]
     dead_times = sorted({t.dead_time for t in terms if t.dead_time > 0.0})
-    corners = [1.0 / abs(c) for c in constants] + [1.0 / d for d in dead_times] or [1.0]
-    low, high = min(corners) * 1e-3, max(corners) * 1e2
-    grid = np.geomspace(low, high, 50 * max(int(math.log10(high / low)), 1))
+    corners = [1.0 / abs(c) for c in (*constants, *dead_times, *times) if c != 0.0] or [1.0]
+    top = math.pi / period if period > 0.0 else 1e2 * max(corners)
+    low = math.floor(math.log10(1e-3 * min(top, *corners)))
+    high = math.ceil(math.log10(top))
+    grid = 10.0 ** (np.arange(low * _PER_DECADE, high * _PER_DECADE + 1) / _PER_DECADE)
+    grid = grid[grid <= top]
     parts = [grid]
+    if period > 0.0:
+        parts.append(top * (1.0 - np.geomspace(1e-6, 0.5, 80)))
     if dead_times:
-        felt = np.max([np.abs(t(1j * grid)) for t in terms], axis=0) > _FELT
-        last = float(grid[felt][-1]) if felt.any() else low
+        values = np.array([loop(1j * grid)] if loop else [t(1j * grid) for t in terms])
+        last = _relevant_frequencies(values, grid)[-1]
     for d in dead_times:
         # First turns of the dead time finely, later ones more coarsely.
-        parts.append(np.arange(0.05, 12.0 * math.pi, 0.05) / d)
+        parts.append(np.arange(0.05, min(12.0 * math.pi, top * d), 0.05) / d)
         parts.append(np.arange(12.0 * math.pi, min(last * d, _MOST_TURNS), 0.2) / d)
     for c in constants:
         if c.imag > 0.0:
             centre, width = 1.0 / abs(c), abs(c.real) / abs(c)
-            parts.append(np.abs(centre * (1.0 + width * np.linspace(-8.0, 8.0, 65))) + low)
-    return np.unique(np.concatenate(parts))
+            parts.append(np.abs(centre * (1.0 + width * np.linspace(-8.0, 8.0, 65))) + grid[0])
+    found = np.unique(np.concatenate(parts))
+    if period == 0.0:
+        return found
+    return np.append(found[found < top * (1.0 - 1e-7)], top * (1.0 - _BEFORE_END))
+
+
+def _relevant_frequencies(values: ComplexArray, grid: FloatArray) -> FloatArray:
+    """Return the frequencies at which some loop has an influence, whatever its phase.
+
+    :param values: of loops, shape (k, n).
+    :param grid: rad/s, shape (n,).
+    """
+    found = grid[np.abs(values).max(axis=0) > _RELEVANT]
+    return found if found.size else grid[:1]
 
 
 def sensitivity_peaks(loop: Loop, grid: FloatArray) -> tuple[float, float]:

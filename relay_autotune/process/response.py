@@ -17,13 +17,6 @@ two changes of the input is the free motion of a small triangular matrix A. With
 
 a sum that ends for equal poles and converges quickly for close ones. So neither equal, nearly
 equal nor widely spread time constants cost accuracy, and no step size enters.
-
-A command is given at each sample and held until the next one. With the step response s, a dead
-time D and the period h,
-
-    G(z) = (1 - z^-1) sum_{m >= 1, m h >= D} s(m h - D) z^-m,
-
-where the sum has a closed form, since s is the free motion of a linear system.
 """
 
 from __future__ import annotations
@@ -125,15 +118,6 @@ class _Cluster:
                 drive[1:] += moved[k][m] * states[m, :-1]
             states[k] = recursion(moved[k][k], drive)
         return states
-
-    def transform(self, z: ComplexArray, first: float, period: float) -> ComplexArray:
-        """Return the z-transform of what the states add to the first output after a unit step."""
-        begin, move = (self.matrix(t) for t in (first, period))
-        matrices = np.eye(len(self.nodes)) - move / z[:, None, None]
-        start = np.broadcast_to(begin[:, -1], (z.size, len(self.nodes)))
-        # A product of matrices would wake the threads of BLAS.
-        moved = np.linalg.solve(matrices, start[..., None])[..., 0]
-        return np.asarray(np.einsum("ns,s->n", moved, self.rows[0]))
 
     def matrix(self, time: float) -> Coordinates:
         """Return exp(A t) for one time."""
@@ -352,22 +336,6 @@ class Modes:
         """
         return np.asarray(self.propagator(time) @ z)
 
-    def step_transform(self, z: ComplexArray, first: float, period: float) -> ComplexArray:
-        """Return the z-transform of the first output after a unit step of the input.
-
-        ``sum_n s(first + n period) z^-n``, s being the step response.
-
-        :param z: outside the unit circle or on it, no pole of the sum, shape (n,).
-        :param first: time of the first sample after the step [s].
-        :param period: of the samples [s].
-        """
-        total = np.zeros(z.size, dtype=np.complex128)
-        for cluster in self._clusters:
-            total += cluster.transform(z, first, period)
-            if cluster.share == 2.0:
-                total += cluster.transform(z.conj(), first, period).conj()
-        return total
-
     def states(
         self, changes: FloatArray, steps: FloatArray, *, backward: bool = False
     ) -> list[Coordinates]:
@@ -444,37 +412,3 @@ def response(model: TransferFunction, time: ArrayLike, u: PiecewiseConstant) -> 
     index = segment[after]
     y[after] = modes.outputs(states, flat[after] - changes[index], index)[0]
     return y.reshape(t.shape)
-
-
-# A dead time of a whole number of periods is recognised in spite of this relative rounding.
-_ROUNDING = 1e-9
-
-
-class HeldProcess:
-    """A process whose input is held between samples, as a function of z.
-
-    :param model: the process, with the dead time of the loop, but none for the hold.
-    :param period: of the samples [s].
-    :param delay: further samples until a command takes effect.
-    """
-
-    def __init__(self, model: TransferFunction, period: float, delay: int = 0) -> None:
-        self.model = model
-        self.period = period
-        wait = max(math.ceil(model.dead_time / period * (1.0 - _ROUNDING)), 1)
-        self._first = max(wait * period - model.dead_time, 0.0)
-        self._wait = wait + delay
-        self._modes = Modes.of(model)
-
-    def __call__(self, z: ComplexArray) -> ComplexArray:
-        """Return y/u at each z, shape (n,).
-
-        :param z: on the unit circle or outside, no pole of the process, not 1 if it integrates.
-        """
-        moved = self._modes.step_transform(z, self._first, self.period)
-        return np.asarray((1.0 - 1.0 / z) * z ** float(-self._wait) * moved)
-
-    @property
-    def unstable_poles(self) -> int:
-        """Number of its poles outside the unit circle."""
-        return sum(1 for t in self.model.time_constants if t.real < 0.0)

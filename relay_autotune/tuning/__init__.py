@@ -11,19 +11,18 @@ from dataclasses import dataclass, replace
 
 from relay_autotune.errors import ModelError, TuningError, look_up
 from relay_autotune.identification.result import Identification
-from relay_autotune.loop.analysis import analyse_loop, is_stable
+from relay_autotune.loop.analysis import Loop, analyse_loop, is_stable
 from relay_autotune.loop.gains import Controller, Gains, Performance
 from relay_autotune.loop.laws import OWN_LAW
-from relay_autotune.loop.sampled_loop import analyse_sampled
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.tuning.ensemble import ensemble, ensemble_ms
+from relay_autotune.tuning.law_cost import cost_of
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.rules import PUBLISHED, Rule
 from relay_autotune.tuning.rules.applicability import is_first_order
 from relay_autotune.tuning.rules.limit_cycle import describing_point_of
 from relay_autotune.tuning.rules.step_response import two_point_fopdt
-from relay_autotune.tuning.sampled_search import cost_of
 from relay_autotune.tuning.task import DesignOptions, DesignTask, cautions
 
 RULES: dict[str, Rule] = {"robust": robust, **PUBLISHED}
@@ -126,8 +125,7 @@ def task_of_model(model: TransferFunction, options: DesignOptions | None = None)
 def design(task: DesignTask, rule: str) -> Gains:
     """Return the gains of a rule, judged on the model and on models within its uncertainty.
 
-    They are judged with the delay that the loop adds to the process: half a sampling period, and
-    the loop's own delay.
+    They are judged on the loop as it runs, with the sampling period and the loop's own delay.
 
     :param task: the process and what is asked of the controller.
     :param rule: one of ``RULES``.
@@ -186,25 +184,22 @@ def judged(task: DesignTask, found: Designed) -> Gains:
     :param found: what the rule gives, with any weight asked for.
     :raises TuningError: if the loop is unstable on the model or on more than 5 % of those around.
     """
-    weight, rule, reason = task.options.setpoint_weight, found.rule, found.reason
+    options, reason = task.options, found.reason
 
     def weighted(controller: Controller) -> Controller:
+        weight = options.setpoint_weight
         return controller if math.isnan(weight) else replace(controller, b=weight)
 
-    controller, bare = weighted(found.controller), None
-    law = task.runs(controller)
-    if law is None:
-        period = task.options.sample_period
-        performance = analyse_loop(controller, task.in_loop(task.model), period)
-        bare, unstable = _bare(controller, task)
-        warnings = (*cautions(performance, task), *unstable)
-    else:
-        performance = analyse_sampled(law, task.held(task.model))
-        reason += f"; for {law.law.name} every {law.period:g} s"
+    law = task.law(weighted(found.controller))
+    controller, performance = law.gains, Loop(law, task.held(task.model)).performance()
+    bare, warnings = None, cautions(performance, task)
+    if options.law:
+        reason += f"; for {options.law} every {options.sample_period:g} s"
         own = None if found.own is None else _on_own_law(task, weighted(found.own))
-        cost = cost_of(law, performance, own)
-        warnings = (*cautions(performance, task), *cost)
-        controller = law.gains
+        warnings += cost_of(law, performance, own)
+    else:
+        bare, unstable = _bare(controller, task)
+        warnings += unstable
     if 0.0 < controller.ti < task.options.sample_period:
         # What it integrates in one sample is more than its proportional part.
         reason += (
@@ -215,14 +210,14 @@ def judged(task: DesignTask, found: Designed) -> Gains:
         reason += "; the uncertainty of the model is not known, so that Ms_95 is Ms"
         ms_95 = performance.ms
     else:
-        ms_95 = max(ensemble_ms(controller, task.exact), performance.ms)
+        ms_95 = max(ensemble_ms(law, task.around), performance.ms)
     return Gains(
         **vars(controller),
         **vars(performance),
-        rule=rule,
+        rule=found.rule,
         ms_95=ms_95,
-        law="" if law is None else law.law.name,
-        law_period=0.0 if law is None else law.period,
+        law=options.law,
+        law_period=options.sample_period if options.law else 0.0,
         bare=bare,
         reason=reason,
         warnings=warnings,
@@ -235,8 +230,7 @@ def _bare(controller: Controller, task: DesignTask) -> tuple[Performance | None,
     if alone == controller:
         return None, ()
     try:
-        model = task.in_loop(task.model)
-        return analyse_loop(alone, model, task.options.sample_period), ()
+        return task.loop(alone).performance(), ()
     except (ModelError, TuningError):
         told = f"the loop needs the filter, tf = {controller.tf:.4g} s: without it, it is unstable"
         return None, (told,) if controller.tf > 0.0 else ()
@@ -244,10 +238,7 @@ def _bare(controller: Controller, task: DesignTask) -> tuple[Performance | None,
 
 def _on_own_law(task: DesignTask, controller: Controller) -> Performance | None:
     """Return what a controller attains with our own law at the same period; None: nothing."""
-    task = _with_own_law(task)
-    law = task.runs(controller)
-    assert law is not None
     try:
-        return analyse_sampled(law, task.held(task.model))
+        return _with_own_law(task).loop(controller).performance()
     except TuningError:
         return None

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.laws import LawRate
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import unstable_at_small_gain
 from relay_autotune.tuning.frontier import Bounds, Responses
@@ -43,10 +44,15 @@ class Candidates:
     def __getitem__(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Candidates:
         return Candidates(self.kp[index], self.ki[index], self.td[index], self.tf[index])
 
-    def controller(self, k: int, sign: int) -> Controller:
-        """Return controller k with the sign of the process."""
-        kp, ki = float(self.kp[k]), float(self.ki[k])
-        return Controller(sign * kp, kp / ki, float(self.td[k]), float(self.tf[k]))
+    def controller(self, k: int, sign: int, rate: LawRate) -> Controller:
+        """Return controller k with the sign of the process.
+
+        :param rate: the law, of which kp and td hold what its integral adds in half a sample.
+        """
+        ki, kd = float(self.ki[k]), float(self.kp[k] * self.td[k])
+        kp = float(self.kp[k]) - rate.law.integral.value * 0.5 * rate.period * ki
+        tf = rate.law.smoothing.setting(float(self.tf[k]), rate.period)
+        return Controller(sign * kp, kp / ki, kd / kp, tf)
 
 
 @dataclass(frozen=True)
@@ -59,18 +65,6 @@ class Optimum:
 
     controller: Controller
     iae: float
-
-
-@dataclass(frozen=True)
-class NoiseLimit:
-    """How much of the measurement noise may reach the command.
-
-    :param gain: largest standard deviation of the command over that of the noise [u/y].
-    :param period: of the samples [s].
-    """
-
-    gain: float
-    period: float
 
 
 def stable_gains(

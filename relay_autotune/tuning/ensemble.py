@@ -14,17 +14,14 @@ from numpy.typing import NDArray
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification
-from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.stability import (
-    at_infinity,
-    closed_loop_unstable_poles,
-    frequencies,
-    winding,
-)
+from relay_autotune.loop.analysis import Loop
+from relay_autotune.loop.gains import ControlLaw
+from relay_autotune.loop.stability import at_infinity, winding
+from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.candidates import allowed_outside
 from relay_autotune.tuning.rules import Rule
-from relay_autotune.tuning.task import DesignTask, HeldSet, ModelSet
+from relay_autotune.tuning.task import DesignTask
 
 _MODELS = 100
 
@@ -67,28 +64,28 @@ class Peaks:
         return int(np.isinf(self.ms).sum())
 
 
-def ensemble_peaks(controller: Controller, models: ModelSet | HeldSet) -> Peaks:
+def ensemble_peaks(law: ControlLaw, models: ModelSet) -> Peaks:
     """Return the robustness of a controller on each of many models.
 
     Stability follows from the number of turns of each loop on the grid; where two points are too
     far apart to count them, the argument principle decides.
 
-    :param controller: the gains.
-    :param models: at least one.
+    :param law: with its gains.
+    :param models: at least one, as the law meets them.
     """
-    loops, distance, unstable = _loops(controller, models)
+    loops, distance, unstable = _loops(law, models)
     ms, mt = 1.0 / distance.min(axis=0), (np.abs(loops) / distance).max(axis=0)
     return Peaks(np.where(unstable, math.inf, ms), np.where(unstable, math.inf, mt))
 
 
-def ensemble_ms(controller: Controller, models: ModelSet | HeldSet) -> float:
+def ensemble_ms(law: ControlLaw, models: ModelSet) -> float:
     """Return the Ms that 95 % of the models do not exceed with one controller.
 
-    :param controller: the gains.
-    :param models: at least one.
+    :param law: with its gains.
+    :param models: at least one, as the law meets them.
     :raises TuningError: if more than 5 % of the loops are unstable.
     """
-    _, distance, unstable = _loops(controller, models)
+    _, distance, unstable = _loops(law, models)
     ms, count = np.where(unstable, math.inf, 1.0 / distance.min(axis=0)), len(models.models)
     value = float(np.sort(ms)[count - 1 - allowed_outside(count)])
     if math.isinf(value):
@@ -101,27 +98,28 @@ def ensemble_ms(controller: Controller, models: ModelSet | HeldSet) -> float:
 
 
 def _loops(
-    controller: Controller, models: ModelSet | HeldSet
+    law: ControlLaw, models: ModelSet
 ) -> tuple[ComplexArray, FloatArray, NDArray[np.bool_]]:
     """Return loops L and |1 + L| on a grid, shape (n, m), and which are unstable, shape (m,)."""
-    if isinstance(models, HeldSet):
-        values, unstable = models.loops(controller)
-        return values, np.abs(1.0 + values), unstable
-    grid = frequencies(*controller.characteristic(models.models[0]))
+    grid = Loop(law, models.models[0]).grid
     # At the first frequency all dynamics except integrators are at rest.
     w = np.concatenate(([1e-6 * grid[0]], grid))
-    loops = controller(1j * w)[:, None] * models(w)
+    loops = law(1j * w)[:, None] * models.at(w)
     moved = 1.0 + loops
-    limits = np.array([_at_infinity(controller, model) for model in models.models])
-    integrators = models.integrators + (1 if controller.ti > 0.0 else 0)
-    count = winding(moved, w, models.unstable_poles, integrators, limits)
+    if law.period > 0.0:
+        end = np.array([1j * math.pi / law.period])
+        limits = (law(end) * models(end))[0].real
+    else:
+        limits = np.array([_at_infinity(law, model) for model in models.models])
+    integrators = models.integrators + (1 if law.i else 0)
+    count = winding(moved, w, models.unstable_poles, integrators, limits, law.period)
     for k in np.flatnonzero(np.isnan(count)):
-        count[k] = closed_loop_unstable_poles(controller.characteristic(models.models[k]))
+        count[k] = Loop(law, models.models[k]).unstable_poles
     return loops[1:], np.abs(moved[1:]), count != 0.0
 
 
-def _at_infinity(controller: Controller, model: TransferFunction) -> float:
-    return 0.0 if model.dead_time > 0.0 else at_infinity(controller.loop(model))
+def _at_infinity(law: ControlLaw, model: TransferFunction) -> float:
+    return 0.0 if model.dead_time > 0.0 else at_infinity(law.characteristic(model)[-1])
 
 
 @dataclass(frozen=True)
@@ -154,10 +152,8 @@ def predicted_ms(task: DesignTask, rule: Rule) -> PredictedMs | None:
         controller, _ = rule(replace(task, models=()))
     except TuningError:
         return None
-    law = task.runs(controller)
-    controller = controller if law is None else law.gains
     models = task.set_of((task.model, *task.models))
-    own, *others = ensemble_peaks(controller, models).ms
+    own, *others = ensemble_peaks(task.law(controller), models).ms
     # No interpolation: some values may be infinite.
     low, high = np.quantile(others, (0.025, 0.975), method="closest_observation")
     return PredictedMs(float(own), float(low), float(high))

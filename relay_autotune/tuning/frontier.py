@@ -3,7 +3,14 @@
 
 r"""The largest integral gain that bounds on Ms and Mt allow, in closed form.
 
-With a filter F, ``L = (kp (1 + td s) + ki/s) F G``. A bound on the sensitivity keeps L(jw) out of
+With a filter F, ``L = (kp (1 + td s) + ki/s) F G``. At a sampling period h the integral of any law
+is, on the unit circle with ``w' = (2/h) tan(w h/2)``,
+
+    I = 1/(j w') + lead h/2,   lead 1 if it is advanced before the output, -1 after it,
+
+so that with ``kp' = kp + lead ki h/2``, ``td' = kp td/kp'``, the filter V and the derivative S the
+loop is ``(kp' (1 + td' S/V) + ki/(j w')) V G``: the same form, exact at the sampling period. In
+what follows kp, td and w are kp', td' and w' then. A bound on the sensitivity keeps L(jw) out of
 a circle around -1, one on the complementary sensitivity out of a circle around a point further
 left (Astrom and Hagglund 1998): ``|L + c| >= r`` with
 
@@ -14,7 +21,8 @@ in the plane of kp and ki,
 
     (kp + c x)^2 + (kp w td + c y - ki/w)^2 < r^2 (x^2 + y^2).
 
-So for given kp, td and tf every frequency forbids the integral gains between
+(in general kp td w is the imaginary part of kp (1 + td S/V), and kp its real part). So for given
+kp, td and tf every frequency forbids the integral gains between
 
     w (kp w td + c y -+ sqrt(r^2 (x^2 + y^2) - (kp + c x)^2)),
 
@@ -34,9 +42,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.arrays import ComplexArray, FloatArray, IntArray
+from relay_autotune.loop.laws import CONTINUOUS, LawRate, polynomial
+from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import unstable_at_small_gain
-from relay_autotune.tuning.task import ModelSet
 
 _ALL = slice(None)
 
@@ -46,6 +55,8 @@ _BEYOND = 3.0
 _NARROW = 0.9
 # Part of kp within which a loop is near -1.
 _NEAR = 0.3
+# Added frequencies stay below half the sampling frequency by this factor.
+_NEAR_END = 0.99
 _NEIGHBOURS = np.array([0.995, 1.0, 1.005])
 
 
@@ -74,18 +85,24 @@ class Responses:
     """Frequency responses of models on one grid, with the sign that makes feedback negative.
 
     :param models: m of them, all with the sign of the first.
-    :param grid: rad/s, shape (n,), increasing; its floating-point type is used throughout.
+    :param grid: rad/s, shape (n,), increasing, up to half the sampling frequency; its
+        floating-point type is used throughout.
     :param crossover: frequency about which loops are closed [rad/s].
+    :param rate: the law and its sampling period.
     """
 
     def __init__(
-        self, models: Sequence[TransferFunction], grid: FloatArray, crossover: float
+        self,
+        models: Sequence[TransferFunction],
+        grid: FloatArray,
+        crossover: float,
+        rate: LawRate = CONTINUOUS,
     ) -> None:
-        self._set, self._sign = ModelSet(models), models[0].process_sign
+        self._set = ModelSet(models, rate.period, rate.law.delay)
+        self._sign, self._rate = models[0].process_sign, rate
         self.count = len(models)
-        self.grid = grid
         self.crossover = crossover
-        self._keep(self._evaluate(grid))
+        self._keep(grid, self._evaluate(grid))
         self._poles = np.array([unstable_at_small_gain(m) for m in models])
         # The loops of these models reach -1 at w = 0 as the gain grows.
         self._at_rest = np.array(
@@ -93,12 +110,17 @@ class Responses:
         )
 
     def _evaluate(self, grid: FloatArray) -> ComplexArray:
-        values = self._sign / self._set(grid.astype(np.float64)).T
+        values = self._sign / self._set(1j * grid.astype(np.float64)).T
         return np.ascontiguousarray(values.astype(np.result_type(grid, np.complex64)))
 
-    def _keep(self, inverse: ComplexArray) -> None:
+    def _keep(self, grid: FloatArray, inverse: ComplexArray) -> None:
+        self.grid, self.inverse = grid, inverse
         self._smallest = np.abs(inverse).min(axis=0)
-        self.inverse = inverse
+        h = self._rate.period
+        if h > 0.0:
+            angle = grid.astype(np.float64) * h
+            self._back = np.exp(-1j * angle)
+            self._warped = (2.0 / h * np.tan(0.5 * angle)).astype(grid.dtype)
 
     def add(self, frequencies: FloatArray) -> None:
         """Add frequencies to the grid, with neighbours on either side.
@@ -106,12 +128,13 @@ class Responses:
         :param frequencies: rad/s, shape (k,).
         """
         near = np.unique(frequencies[:, None] * _NEIGHBOURS)
+        if self._rate.period > 0.0:
+            near = np.unique(np.minimum(near, _NEAR_END * math.pi / self._rate.period))
         near = near[~np.isin(near, self.grid)]
         grid = np.concatenate((self.grid, near))
         order = np.argsort(grid)
         inverse = np.concatenate((self.inverse, self._evaluate(near)), axis=1)
-        self.grid = grid[order]
-        self._keep(inverse[:, order])
+        self._keep(grid[order], inverse[:, order])
 
     def largest_ki(
         self,
@@ -124,30 +147,63 @@ class Responses:
         """Return the largest integral gains that the bounds leave, and how far they may fall.
 
         :param bounds: on the sensitivities.
-        :param kp: proportional gains, positive, shape (k,).
-        :param td: derivative times [s], shape (k,).
+        :param kp: kp', positive, shape (k,).
+        :param td: td' [s], shape (k,).
         :param tf: time constants of the filter [s], shape (k,).
         :param of: which models, m of them.
         :return: upper and lower ends of the range, shape (k, m), for the controllers in each
             model; an upper end not positive: none is allowed; infinite: any above the lower.
         """
-        column = self._felt(bounds, kp, td, tf)
-        w, inverse = self.grid[column], self.inverse[of][None, :, column]
-        if np.any(tf):
-            s = 1j * w * tf[:, None]
-            inverse = (1.0 + s + 0.5 * s * s)[:, None, :] * inverse
+        if not kp.size:
+            # No filter keeps the limit of the noise.
+            return (np.empty((0, self._poles[of].size)),) * 2
+        column = self._relevant(bounds, kp, td, tf)
+        w, own, unfiltered = self._law(kp, td, tf, column)
+        inverse = self.inverse[of][None, :, column]
+        if unfiltered is not None:
+            inverse = unfiltered[:, None, :] * inverse
         # Arithmetic on the parts is faster where they lie together.
         x, y = np.ascontiguousarray(inverse.real), np.ascontiguousarray(inverse.imag)
-        reach = kp[:, None, None] + x
-        height = (kp * td)[:, None, None] * w + y
-        count = self._poles[of] + _gained(x, reach, height)
-        begun = np.where(reach[..., 0] > 0.0, np.where(height[..., 0] > 0.0, -1, 1), 0)
-        count = count + np.where(self._at_rest[of], begun, 0)
-        stable = np.where(count == 0, first_crossing(reach, w * height, kp), 0.0)
-        rest = kp[:, None, None], (kp * td)[:, None, None] * w
-        return envelope(bounds, rest, w, (x, y), stable)
+        base, lead = own
+        reach = base + x
+        count = self._poles[of] + _gained((base, lead), (x, y), sampled=self._rate.period > 0.0)
+        # A loop that begins left of -1 has a real pole there, which moves with the phase.
+        turns = np.sign(lead[..., 0] * x[..., 0] - base[..., 0] * y[..., 0])
+        count = count + np.where(self._at_rest[of] & (reach[..., 0] > 0.0), turns, 0.0)
+        with np.errstate(invalid="ignore"):
+            crossing = first_crossing(reach, w * (lead + y), kp)
+        return envelope(bounds, own, w, (x, y), np.where(count == 0, crossing, 0.0))
 
-    def _felt(
+    def _law(
+        self, kp: FloatArray, td: FloatArray, tf: FloatArray, column: NDArray[np.bool_]
+    ) -> tuple[FloatArray, tuple[FloatArray, FloatArray], ComplexArray | None]:
+        """Return what the law does at some frequencies.
+
+        :return: w', shape (n,); real and imaginary part of kp' (1 + td' S/V), shape (k, 1, n or
+            1); 1/V, shape (k, n), None: there is no filter.
+        """
+        h, smoothing = self._rate.period, self._rate.law.smoothing
+        gain, lead, dtype = kp[:, None, None], (kp * td)[:, None, None], self.inverse.dtype
+        filtered = bool(np.any(tf))
+        if h == 0.0:
+            w = self.grid[column]
+            s = 1j * w * tf[:, None]
+            return w, (gain, lead * w), 1.0 + s + 0.5 * s * s if filtered else None
+        w, back, time = self._warped[column], self._back[column], tf[:, None]
+        slope = smoothing.slope(time, h)
+        if not (filtered and smoothing.on_measurement):
+            values = np.atleast_2d(slope(back)) if np.any(td) else np.zeros((1, w.size), dtype)
+            unfiltered = None
+        else:
+            # Value and slope of one filter have their denominator in common.
+            value = smoothing.value(time, h)
+            above = polynomial(value.top, back)
+            values = polynomial(slope.top, back) / above
+            unfiltered = (polynomial(value.bottom, back) / above).astype(dtype)
+        values = values.astype(dtype)[:, None, :]
+        return w, (gain + lead * values.real, lead * values.imag), unfiltered
+
+    def _relevant(
         self, bounds: Bounds, kp: FloatArray, td: FloatArray, tf: FloatArray
     ) -> NDArray[np.bool_]:
         """Return the frequencies at which some loop is large enough to meet a bound.
@@ -155,27 +211,55 @@ class Responses:
         Beyond the crossover the integral adds little to the loop.
         """
         w = self.grid
-        largest = (kp[:, None] * np.hypot(1.0, td[:, None] * w)).max(axis=0)
-        smallest = self._smallest * np.sqrt(1.0 + 0.25 * (w * tf.min()) ** 4)
+        largest = np.sqrt((kp[:, None] ** 2 + ((kp * td)[:, None] * w) ** 2).max(axis=0))
+        smallest = self._smallest
+        if self._rate.period == 0.0:
+            smallest = smallest * np.sqrt(1.0 + 0.25 * (w * tf.min()) ** 4)
         room = min(c - r for c, r in bounds.circles)
-        return np.asarray((w < _BEYOND * self.crossover) | (2.0 * largest > room * smallest))
+        found = (w < _BEYOND * self.crossover) | (2.0 * largest > room * smallest)
+        # The end of the circle, where a loop has a real pole.
+        found[-1] |= self._rate.period > 0.0
+        return np.asarray(found)
 
 
-def _gained(x: FloatArray, reach: FloatArray, height: FloatArray) -> NDArray[np.int_]:
-    """Return how many poles kp and kd bring to the right half plane, shape (k, m).
+def _gained(
+    own: tuple[FloatArray, FloatArray], parts: tuple[FloatArray, FloatArray], *, sampled: bool
+) -> FloatArray:
+    """Return how many unstable poles come as the loops' gain grows to 1, shape (k, m).
 
-    A pair for each time the loop crosses the negative real axis left of -1 with falling phase,
-    and one pair less with rising phase.
+    A pair for each crossing of the negative real axis left of -1 with falling phase, one pair less
+    with rising phase, and of sampled loops one pole where a loop ends left of -1 at half the
+    sampling frequency.
 
-    :param x: real part of 1/(F G), shape (k or 1, m, n).
-    :param reach: kp + x, positive left of -1 where x is negative, shape (k, m, n).
-    :param height: kp w td + y, positive above the axis, shape (k, m, n).
+    :param own: real and imaginary part of the law over its filter, shape (k, 1, n or 1).
+    :param parts: real and imaginary part of 1/(V G), shape (k or 1, m, n).
+    :param sampled: whether the grid ends at half the sampling frequency.
     """
-    above = height > 0.0
-    left = (x < 0.0) & (reach > 0.0)
-    falls = (above[..., :-1] & ~above[..., 1:] & left[..., 1:]).sum(axis=-1)
-    rises = (~above[..., :-1] & above[..., 1:] & left[..., 1:]).sum(axis=-1)
-    return np.asarray(2 * (falls - rises))
+    (base, lead), (x, y) = own, parts
+    # Whether Im L > 0.
+    above = (lead / base * x > y) != (base < 0.0)
+    flat = np.flatnonzero(above[..., :-1] != above[..., 1:])
+    which, n = np.divmod(flat, above.shape[-1] - 1)
+    k, m = np.divmod(which, above.shape[1])
+
+    def loop(at: IntArray) -> ComplexArray:
+        """Return L at the ends of the cells with a crossing."""
+        p, q, u, v = (np.broadcast_to(part, above.shape)[k, m, at] for part in (base, lead, x, y))
+        return np.asarray((p + 1j * q) / (u + 1j * v))
+
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        before, after = loop(n), loop(n + 1)
+        share = before.imag / (before.imag - after.imag)
+        left = before.real + share * (after.real - before.real) < -1.0
+    turned = np.where(left, np.where(after.imag > 0.0, 2.0, -2.0), 0.0)
+    size = above.shape[0] * above.shape[1]
+    found = np.bincount(which, turned, size).astype(float).reshape(above.shape[:-1])
+    if sampled:
+        p, q, u, v = base[..., -1], lead[..., -1], x[..., -1], y[..., -1]
+        with np.errstate(over="ignore"):
+            ends_left = p * u + q * v < -(u * u + v * v)
+        found -= np.where(ends_left, np.sign(q * u - p * v), 0.0)
+    return found
 
 
 def envelope(
@@ -303,11 +387,12 @@ def _least(values: FloatArray, x: FloatArray) -> FloatArray:
     return np.where(inside, np.minimum(bottom, least), least)
 
 
-def design_grid(model: TransferFunction, frequency: float) -> FloatArray:
+def design_grid(model: TransferFunction, frequency: float, period: float = 0.0) -> FloatArray:
     """Return the frequencies at which bounds are tested [rad/s].
 
     :param model: the process.
     :param frequency: about which the loop is closed [rad/s].
+    :param period: of the samples, to half whose frequency the grid goes [s]; 0: continuous.
     """
     parts = [
         frequency * np.geomspace(low, high, count)
@@ -323,4 +408,11 @@ def design_grid(model: TransferFunction, frequency: float) -> FloatArray:
             width = abs(c.real) / abs(c)
             around = (1.0 + width * np.linspace(-6.0, 6.0, 49)) / abs(c)
             parts.append(around[around > 0.0])
-    return np.unique(np.concatenate(parts))
+    if period == 0.0:
+        return np.unique(np.concatenate(parts))
+    top = math.pi / period
+    parts.append(top * (1.0 - np.geomspace(1e-6, 0.5, 60)))
+    if top > 100.0 * frequency:
+        parts.append(np.geomspace(100.0 * frequency, top, 60)[:-1])
+    found = np.unique(np.concatenate(parts))
+    return found[(found < top) & (found >= 1e-3 * frequency)]

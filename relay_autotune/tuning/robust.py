@@ -11,14 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.analysis import abscissae, inverted, measurement_from_load
+from relay_autotune.loop.analysis import Loop, abscissae, inverted
 from relay_autotune.loop.gains import Controller
-from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.candidates import NoiseLimit, Optimum
+from relay_autotune.tuning.candidates import Optimum
 from relay_autotune.tuning.frontier import Bounds
-from relay_autotune.tuning.sampled_search import SampledSearch
 from relay_autotune.tuning.search import Search
-from relay_autotune.tuning.task import MS_RANGE, DesignOptions, DesignTask
+from relay_autotune.tuning.task import MS_RANGE, DesignTask
 
 # PID has to lower the IAE at least this far to be worth its derivative.
 WORTH = 0.75
@@ -48,8 +46,8 @@ class _Attempt:
 def robust(task: DesignTask) -> tuple[Controller, str]:
     """Return the controller with the smallest IAE after a load step, with bounds on Ms and Mt.
 
-    The bounds hold on the model and on 95 % of the models within its uncertainty, with half a
-    sampling period and the loop's own delay added to the dead time. The optimisation follows
+    The bounds hold on the model and on 95 % of the models within its uncertainty, for the law that
+    will run and its sampling period, with the loop's own delay. The optimisation follows
     Astrom, Panagopoulos and Hagglund (1998) in its bounds and Garpinger and Hagglund (2015) in
     its cost. PI is preferred; PID is chosen if its IAE is lower by 25 % or more, or if no PI
     controller keeps the bounds. If no controller keeps a bound, it is raised to 15 % above the
@@ -74,27 +72,17 @@ def robust(task: DesignTask) -> tuple[Controller, str]:
             "no controller with a gain above zero keeps the bounds on the model and those around "
             "it: it is not known well enough; record a longer or larger test"
         )
-    return with_setpoint_weight(controller, search.model, search.frequency), reason
+    return with_setpoint_weight(controller, task.loop(controller), search.frequency), reason
 
 
 def _search(task: DesignTask) -> Search:
-    """Return the search on the process in its loop, exact for a law that was named."""
-    options, model = task.options, task.in_loop(task.model)
-    others = [m for m in task.models if m.process_sign == model.process_sign]
-    around = tuple(task.in_loop(m) for m in others)
-    law, noise = options.runs, _noise_limit(options)
-    if law is None:
-        return Search(model, around, options.filter_ratio, noise)
-    return SampledSearch(
-        model,
-        around,
-        options.filter_ratio,
-        noise,
-        law=law,
-        period=options.sample_period,
-        held=task.held(task.model),
-        held_models=tuple(task.held(m) for m in others),
-    )
+    """Return the search on the process in its loop."""
+    options, model = task.options, task.held(task.model)
+    around = tuple(task.held(m) for m in task.models if m.process_sign == model.process_sign)
+    noise = math.inf
+    if options.noise_std > 0.0 and options.amplitude > 0.0 and options.sample_period > 0.0:
+        noise = options.noise_share * options.amplitude / options.noise_std
+    return Search(model, around, options.filter_ratio, noise, options.rate)
 
 
 def _chosen(search: Search, bounds: Bounds) -> tuple[Controller, str]:
@@ -117,7 +105,7 @@ def _chosen(search: Search, bounds: Bounds) -> tuple[Controller, str]:
         return pi.optimum.controller, _promise(pi, search)
     if share > WORTH:
         reason = f"PID would still have {100.0 * share:.0f} % of its IAE"
-    elif search.noise is None:
+    elif math.isinf(search.noise):
         reason = (
             f"PID would have {100.0 * share:.0f} % of its IAE, and is chosen where noise, "
             "amplitude and sampling period are given, as by a recording"
@@ -126,15 +114,6 @@ def _chosen(search: Search, bounds: Bounds) -> tuple[Controller, str]:
         reason = f"{_promise(other, search)}; its IAE is {100.0 * share:.0f} % of that of PI"
         return other.optimum.controller, reason
     return pi.optimum.controller, f"{_promise(pi, search)}; {reason}"
-
-
-def _noise_limit(options: DesignOptions) -> NoiseLimit | None:
-    """Return what is asked of the noise in the command; None: the noise is not known."""
-    known = options.noise_std > 0.0 and options.amplitude > 0.0 and options.sample_period > 0.0
-    if not known:
-        return None
-    largest = options.noise_share * options.amplitude / options.noise_std
-    return NoiseLimit(largest, options.sample_period)
 
 
 def _within(search: Search, bounds: Bounds, derivative: bool) -> _Attempt | None:
@@ -149,8 +128,8 @@ def _relaxed(search: Search, asked: Bounds, derivative: bool) -> _Attempt:
     :raises TuningError: if none holds the process.
     """
     kind, warnings = _KINDS[derivative], []
-    if search.noise is not None:
-        quiet = replace(search, noise=None)
+    if math.isfinite(search.noise):
+        quiet = replace(search, noise=math.inf)
         found = _within(quiet, asked, derivative)
         warning = (
             "no controller keeps both the bounds and the limit of the noise in the command: the "
@@ -190,7 +169,7 @@ def _relaxation(kind: str, name: str, asked: float, least: float, used: float) -
 
 def _cannot_hold(search: Search, kind: str, least: float) -> str:
     """Return a sentence that names the limit which was crossed."""
-    model = search.model
+    model = search.late
     if model.structure == "unstable_fopdt":
         ratio = model.dead_time / abs(model.time_constants[0].real)
         limit = f"an unstable process with D/tau = {ratio:.3g} (PI needs less than 1, PID than 2)"
@@ -217,9 +196,7 @@ def _promise(attempt: _Attempt, search: Search) -> str:
     return "; ".join((promise, *attempt.warnings))
 
 
-def with_setpoint_weight(
-    controller: Controller, model: TransferFunction, frequency: float
-) -> Controller:
+def with_setpoint_weight(controller: Controller, loop: Loop, frequency: float) -> Controller:
     """Return the controller with the largest weight b without unnecessary overshoot.
 
     The response is ``y_i + b y_p``, with one part from the integral and one from the proportional
@@ -227,15 +204,15 @@ def with_setpoint_weight(
     whose overshoot is at most 5 %, or at most 2 % more than the least.
 
     :param controller: PI or PID, of a stable loop.
-    :param model: the process, with all dead time of the loop.
+    :param loop: its loop with the process.
     :param frequency: about which the loop is closed [rad/s].
     """
-    reset = controller.ti
+    model, reset = loop.model, controller.ti
     if model.is_stable:
         reset += 1.0 / abs(controller.i * model.gain)
     duration = _RESETS * reset + _TURNS * 2.0 * math.pi / frequency
     at = abscissae(duration, _POINTS)
-    through = measurement_from_load(controller, model, at) / at
+    through = model(at) / (at * (1.0 + loop(at)))
     proportional = inverted(controller.kc * through, duration)
     integral = inverted(controller.i * through / at, duration)
     highest = np.array([float((integral + b * proportional).max()) for b in _WEIGHTS])

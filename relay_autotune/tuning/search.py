@@ -28,24 +28,25 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from relay_autotune.arrays import FloatArray
+from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.analysis import abscissae, filter_for, inverted
+from relay_autotune.loop.analysis import Loop, abscissae, inverted
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.stability import frequencies, peaks
+from relay_autotune.loop.laws import CONTINUOUS, LawRate, Slope
+from relay_autotune.loop.stability import peaks
+from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.tuning.candidates import (
-    Candidates,
-    NoiseLimit,
-    Optimum,
-    Surroundings,
-    stable_gains,
-)
+from relay_autotune.tuning.candidates import Candidates, Optimum, Surroundings, stable_gains
 from relay_autotune.tuning.frontier import Bounds, Responses, design_grid
+from relay_autotune.tuning.noise import filters_of
 
 _POINTS = 512
 _RESETS, _TURNS = 6.0, 5.0
+# Length of a sampled load response in ultimate periods, and range of its number of samples.
+_PERIODS, _LEAST_SAMPLES, _MOST_SAMPLES = 32.0, 256, 2048
+# Samples in an ultimate period above which its cost is as good as that of the continuous loop.
+_FAST = 25.0
 
 
 def load_iaes(
@@ -162,6 +163,10 @@ _FAR_LATER = 3.0
 # A bound counts as kept up to this factor; frequencies are added to the grid at most so often.
 _HELD, _MOST_ADDED = 1.0 + 1e-4, 6
 _UNLIMITED = 0.1
+# The range of gains of the continuous loop is left by this factor at a sampling period.
+_WIDER = 1.6
+# An integral that is advanced before the output takes at most this part of kp' from kp.
+_SHARE = 0.95
 _NO_LIMIT = (
     "nothing limits the gain of a controller on this model, which has no dead time: give the "
     "controller's sampling period or the loop's delay"
@@ -172,40 +177,52 @@ _NO_LIMIT = (
 class Search:
     """A process, and the limits that its controller must keep.
 
-    :param model: the process, with all dead time of the loop.
+    Candidates hold kp' and td' of :mod:`~relay_autotune.tuning.frontier`.
+
+    :param model: the process, with the dead time of the loop, but none for the hold.
     :param models: models within its uncertainty; the bounds also hold on all but 5 % of them.
     :param filter_ratio: largest td/tf.
-    :param noise: the limit of the noise in the command; None: no limit.
+    :param noise: largest standard deviation of the command per that of the noise in the samples
+        [u/y]; infinite: no limit.
+    :param rate: the law that runs the gains, and its sampling period.
     """
 
     model: TransferFunction
     models: tuple[TransferFunction, ...] = ()
     filter_ratio: float = 10.0
-    noise: NoiseLimit | None = None
+    noise: float = math.inf
+    rate: LawRate = CONTINUOUS
 
     @property
     def differentiates(self) -> bool:
-        """True if the controller may have a derivative."""
-        return True
+        """True if the law has a derivative."""
+        return self.rate.law.slope is not Slope.NONE
+
+    @cached_property
+    def late(self) -> TransferFunction:
+        """The process with a dead time for the hold, as it is met about the crossover."""
+        lag = self.rate.law.lag(self.rate.period)
+        return replace(self.model, dead_time=self.model.dead_time + lag)
 
     @cached_property
     def frequency(self) -> float:
         """Frequency about which the loop is closed [rad/s]."""
-        point = ultimate_point(self.model)
+        point = ultimate_point(self.late)
         if point is not None:
             return point.frequency
-        constants = [abs(c) for c in (*self.model.time_constants, self.model.dead_time) if c]
+        constants = [abs(c) for c in (*self.late.time_constants, self.late.dead_time) if c]
         return 1.0 / min(constants, default=1.0)
 
     @cached_property
     def _largest_kp(self) -> float:
         """A gain that is larger than any useful one, for loops that are stable at every gain."""
-        return 1e4 / abs(complex(self.model(1j * self.frequency)))
+        return 1e4 / abs(complex(self.late(1j * self.frequency)))
 
     @cached_property
     def responses(self) -> Responses:
         """Response of the process, at the frequencies where bounds are tested."""
-        return Responses((self.model,), design_grid(self.model, self.frequency), self.frequency)
+        grid = design_grid(self.late, self.frequency, self.rate.period)
+        return Responses((self.model,), grid, self.frequency, self.rate)
 
     @cached_property
     def around(self) -> Surroundings | None:
@@ -214,32 +231,36 @@ class Search:
             return None
         # A loop with a model of a far longer dead time is closed at lower frequencies.
         longest = max(m.dead_time for m in self.models)
-        later = min(1.0, _FAR_LATER * self.model.dead_time / longest) if longest > 0.0 else 1.0
+        later = min(1.0, _FAR_LATER * self.late.dead_time / longest) if longest > 0.0 else 1.0
         grid = self.responses.grid
-        few = grid[grid > 0.03 * later * self.frequency][::2]
-        return Surroundings(self._responses_of_models(few))
-
-    def _responses_of_models(self, grid: FloatArray) -> Responses:
+        few = np.unique(np.append(grid[grid > 0.03 * later * self.frequency][::2], grid[-1]))
         # Single precision is twice as fast and more than an ensemble needs.
-        return Responses(self.models, grid.astype(np.float32), self.frequency)
+        single = few.astype(np.float32)
+        return Surroundings(Responses(self.models, single, self.frequency, self.rate))
 
     def _controller(self, best: Candidates) -> Controller:
         """Return the first of some candidates, with the sign of the process."""
-        return best.controller(0, self.model.process_sign)
+        return best.controller(0, self.model.process_sign, self.rate)
 
     def _peaks(self, controller: Controller) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return Ms and Mt of a controller on the process, each with its frequency."""
-        exact = controller.loop(self.model)
-        return peaks(exact, frequencies(exact))
+        exact = Loop(self.rate.of(controller), self.model)
+        return peaks(exact, exact.grid)
 
     def _ceiling(self, kp: FloatArray) -> FloatArray | float:
         """Return the integral gains that each proportional gain allows by itself, shape (k,)."""
-        del kp
-        return math.inf
+        # An integral that is advanced before the output takes a part of kp'; the rest is kp.
+        lead = self.rate.law.integral.value * self.rate.period
+        return _SHARE * 2.0 * kp / lead if lead > 0.0 else math.inf
 
     def _span(self, td: float) -> tuple[float, float] | None:
         """Return the range of proportional gains to look at for a derivative time [s]."""
-        return stable_gains(self.model, self.responses.grid, td, td / self.filter_ratio)
+        # Higher frequencies than the sampled loop has may have limited the gain.
+        grid = design_grid(self.late, self.frequency)
+        span = stable_gains(self.late, grid, td, td / self.filter_ratio)
+        if span is None or self.rate.period == 0.0:
+            return span
+        return span[0] / _WIDER, span[1] * _WIDER
 
     def _among(self, around: Surroundings | None) -> Search:
         """Return this search with other models around the process; its responses are kept."""
@@ -351,7 +372,7 @@ class Search:
             ki, _ = self._limits(bounds, kp, zero, zero)
             k = int(np.argmax(ki))
             best, step = float(kp[k]), step / 4.0
-        return Candidates(kp, ki, zero, zero).controller(k, self.model.process_sign)
+        return Candidates(kp, ki, zero, zero).controller(k, self.model.process_sign, self.rate)
 
     def _times(self, derivative: bool) -> FloatArray:
         return _TIMES * 2.0 * math.pi / self.frequency if derivative else np.zeros(1)
@@ -522,6 +543,9 @@ class Search:
     @cached_property
     def _beyond(self) -> float:
         """Integral gain that closes the loop at the highest frequency of the grid [u/(y s)]."""
+        if self.rate.period > 0.0:
+            # The grid ends where all frequencies do.
+            return math.inf
         highest = float(self.responses.grid[-1])
         return highest / float(np.abs(self.model(1j * highest)))
 
@@ -551,10 +575,29 @@ class Search:
 
     def _filters(self, kp: FloatArray, td: FloatArray) -> FloatArray:
         """Return the filter that each controller needs [s], shape (k,)."""
-        least = td / self.filter_ratio
-        if self.noise is None:
-            return least
-        return np.maximum(least, filter_for(td, self.noise.gain / kp, self.noise.period))
+        return filters_of(self.rate, td, self.noise / kp, self.filter_ratio)
 
     def _iaes(self, c: Candidates) -> FloatArray:
-        return load_iaes(self.model, c.kp, c.ki, c.td, c.tf, self.frequency)
+        """Return the IAE of a unit step of the load for each controller [y s/u]."""
+        h, smoothing = self.rate.period, self.rate.law.smoothing
+        if 2.0 * math.pi / self.frequency > _FAST * h:
+            return load_iaes(self.late, c.kp, c.ki, c.td, c.tf, self.frequency)
+        s, process = self._line
+        back, tf = np.exp(-s * h), c.tf[:, None]
+        p, d, i = c.kp[:, None], (c.kp * c.td)[:, None], c.ki[:, None]
+        law = smoothing.value(tf, h)(back) * (p + i * 0.5 * h * (1.0 + back) / (1.0 - back))
+        if np.any(c.td):
+            law = law + d * smoothing.slope(tf, h)(back)
+        duration = (s.size - 1) * h
+        y = inverted(h * process / ((1.0 - back) * (1.0 + law * process)), duration, sampled=True)
+        return np.asarray(1.0 / c.ki + 2.0 * h * np.maximum(-y, 0.0).sum(axis=1))
+
+    @cached_property
+    def _line(self) -> tuple[ComplexArray, ComplexArray]:
+        """Return where sampled responses are transformed, and the process there."""
+        h = self.rate.period
+        wanted = max(int(_PERIODS * 2.0 * math.pi / (self.frequency * h)), _LEAST_SAMPLES - 1)
+        samples = min(1 << wanted.bit_length(), _MOST_SAMPLES)
+        s = abscissae(samples * h, samples)
+        held = ModelSet((self.model,), h, self.rate.law.delay)
+        return s, self.model.process_sign * held(s)[:, 0]

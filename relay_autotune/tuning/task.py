@@ -6,129 +6,18 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-import numpy as np
-from numpy.typing import NDArray
-
-from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller, Performance
-from relay_autotune.loop.laws import LAWS, OWN_LAW, Law, SampledLaw
-from relay_autotune.loop.sampled_loop import SampledLoop, sampled_grid
-from relay_autotune.process.response import HeldProcess
+from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate, SampledLaw
+from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.quantities import check, quantity
-
-_Constants = Sequence[tuple[complex, ...]]
-
-
-class ModelSet:
-    """Similar models, such as those within an uncertainty.
-
-    :param models: m of them, at least one.
-    :ivar integrators: of each model, shape (m,).
-    :ivar unstable_poles: how many each has in the right half plane, shape (m,).
-    """
-
-    def __init__(self, models: Sequence[TransferFunction]) -> None:
-        self.models = tuple(models)
-        self.integrators = np.array([m.integrators for m in self.models])
-        self.unstable_poles = np.array(
-            [sum(t.real < 0.0 for t in m.time_constants) for m in self.models]
-        )
-        alike = defaultdict(list)
-        for k, model in enumerate(self.models):
-            alike[len(model.zeros), len(model.time_constants), model.integrators].append(k)
-        self._groups = [(integrators, np.array(of)) for (_, _, integrators), of in alike.items()]
-        # Frequencies and responses in one, for several threads.
-        self._known: tuple[FloatArray, ComplexArray] | None = None
-
-    def __call__(self, frequency: FloatArray) -> ComplexArray:
-        """Return the response of each model at each frequency.
-
-        The values at the frequencies of the first call are kept, since the grids for the loops
-        of one process have most of their frequencies in common.
-
-        :param frequency: rad/s, shape (n,), increasing.
-        :return: y/u, shape (n, m).
-        """
-        if self._known is None:
-            self._known = frequency, self._evaluate(frequency)
-        known, responses = self._known
-        place = np.minimum(np.searchsorted(known, frequency), known.size - 1)
-        found = responses[place]
-        new = known[place] != frequency
-        found[new] = self._evaluate(frequency[new])
-        return found
-
-    def _evaluate(self, frequency: FloatArray) -> ComplexArray:
-        w = frequency[:, None]
-        s = 1j * w
-        found = np.empty((frequency.size, len(self.models)), dtype=np.complex128)
-        for integrators, of in self._groups:
-            models = [self.models[k] for k in of]
-            lag = np.array([m.dead_time for m in models]) * w
-            gain = np.array([m.gain for m in models])
-            values = np.empty(lag.shape, dtype=np.complex128)
-            # Much faster than a complex exponential.
-            values.real, values.imag = gain * np.cos(lag), -gain * np.sin(lag)
-            if integrators:
-                values *= s ** float(-integrators)
-            for zero in _columns([m.zeros for m in models]):
-                values *= 1.0 + zero * s
-            for constant in _columns([m.time_constants for m in models]):
-                values /= 1.0 + constant * s
-            found[:, of] = values
-        return found
-
-
-def _columns(constants: _Constants) -> ComplexArray:
-    """Return the first constant of each model, then the second, and so on, shape (p, m)."""
-    return np.array(constants, dtype=np.complex128).T
-
-
-@dataclass(frozen=True)
-class HeldSet:
-    """Models between hold and sampler, for the exact loops of a law.
-
-    :param models: with the dead time of the loop, but none for the hold.
-    :param law: the law.
-    :param period: of the samples [s].
-    """
-
-    models: tuple[TransferFunction, ...]
-    law: Law
-    period: float
-
-    @cached_property
-    def _held(self) -> list[HeldProcess]:
-        return [HeldProcess(model, self.period) for model in self.models]
-
-    @cached_property
-    def _known(self) -> dict[tuple[float, int], ComplexArray]:
-        """Responses of the models, by the begin and the size of the grid."""
-        return {}
-
-    def loops(self, controller: Controller) -> tuple[ComplexArray, NDArray[np.bool_]]:
-        """Return the loops on a grid, shape (n, m), and which of them are unstable, shape (m,).
-
-        :param controller: the gains, as far as the law can have them.
-        """
-        law = self.law.at(controller, self.period)
-        grid = sampled_grid(self.models[0], controller, self.period)
-        z, key = np.exp(1j * grid * self.period), (float(grid[0]), grid.size)
-        if key not in self._known:
-            self._known[key] = np.column_stack([held(z) for held in self._held])
-        values = law.from_measurement(z)[:, None] * self._known[key]
-        each = zip(self.models, self._held, values.T, strict=True)
-        unstable = [SampledLoop(law, m, h).unstable_from(grid, v) != 0.0 for m, h, v in each]
-        return values, np.array(unstable)
-
 
 CONTROLLERS = ("auto", "pi", "pid")
 MS_RANGE = (1.2, 4.0)
@@ -161,8 +50,8 @@ class DesignOptions:
         "Set-point weight b; NaN: the rule's own."
     )
     sample_period: float = quantity(0.0, "s", lower=0.0).means(
-        "Sampling period of the controller, half of which counts as dead time; 0: the "
-        "recording's, or continuous where there is no recording."
+        "Sampling period of the controller; 0: the recording's, or continuous where there is no "
+        "recording."
     )
     loop_delay: float = quantity(0.0, "s", lower=0.0).means(
         "Dead time that the controller's loop adds to the process."
@@ -189,7 +78,7 @@ class DesignOptions:
     )
     law: str = quantity("", choices=("", *LAWS)).means(
         "Law that the gains are for, exact at the sampling period, such as pid_controller; not "
-        "given: controller_node's, with half a period as dead time."
+        "given: controller_node's."
     )
 
     def __post_init__(self) -> None:
@@ -204,24 +93,23 @@ class DesignOptions:
     def added_delay(self) -> float:
         """Dead time that the loop adds to the process: half a period of the hold, and its own [s].
 
-        A sample that is held for a period lags by half of it on average.
+        A sample that is held for a period lags by half of it on average. Rules that are formulas
+        for a dead time take it; loops that are judged have no such approximation.
         """
-        held = LAWS[self.law or OWN_LAW].lag(self.sample_period)
-        return held + self.loop_delay
+        return LAWS[self.law or OWN_LAW].lag(self.sample_period) + self.loop_delay
 
     @property
-    def runs(self) -> Law | None:
-        """The law that the gains are for; None: none was named.
+    def rate(self) -> LawRate:
+        """The law that the gains are for, controller_node's unless another was named.
 
-        :raises TuningError: if it was named without a sampling period.
+        :raises TuningError: if another was named without a sampling period.
         """
-        if self.law == "":
-            return None
-        if self.sample_period == 0.0:
+        law = LAWS[self.law or OWN_LAW]
+        if self.sample_period == 0.0 and self.law:
             raise TuningError(
                 f"{self.law} runs at a sampling period, and none is known: give sample_period"
             )
-        return LAWS[self.law]
+        return LawRate(law, self.sample_period)
 
     def largest_mt(self, model: TransferFunction) -> float:
         """Return the bound on Mt for a process.
@@ -265,34 +153,32 @@ class DesignTask:
         """
         return replace(model, dead_time=model.dead_time + self.options.loop_delay)
 
-    def runs(self, controller: Controller) -> SampledLaw | None:
-        """Return the law that will run, with what it can do of a controller; None: not named.
+    def law(self, controller: Controller) -> SampledLaw:
+        """Return the law that will run, with what it can do of a controller.
 
         :param controller: the gains that a rule gives.
         """
-        law, period = self.options.runs, self.options.sample_period
-        return None if law is None else law.at(law.best(controller, period), period)
+        return self.options.rate.of(controller)
 
-    def set_of(self, models: Sequence[TransferFunction]) -> ModelSet | HeldSet:
-        """Return models as the loop has them.
+    def loop(self, controller: Controller) -> Loop:
+        """Return the loop of a controller and the process, as the law runs it.
+
+        :param controller: the gains that a rule gives.
+        """
+        return Loop(self.law(controller), self.held(self.model))
+
+    def set_of(self, models: Sequence[TransferFunction]) -> ModelSet:
+        """Return models as the loop meets them.
 
         :param models: such as those within the uncertainty.
         """
-        law = self.options.runs
-        if law is None:
-            return ModelSet([self.in_loop(model) for model in models])
-        held = tuple(self.held(model) for model in models)
-        return HeldSet(held, law, self.options.sample_period)
+        rate = self.options.rate
+        return ModelSet([self.held(model) for model in models], rate.period)
 
     @cached_property
     def around(self) -> ModelSet:
-        """The models within the uncertainty, with the dead time that the loop adds to them."""
-        return ModelSet([self.in_loop(model) for model in self.models])
-
-    @cached_property
-    def exact(self) -> ModelSet | HeldSet:
-        """The models within the uncertainty, as the law that was named has them."""
-        return self.around if self.options.runs is None else self.set_of(self.models)
+        """The models within the uncertainty, as the loop meets them."""
+        return self.set_of(self.models)
 
 
 def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:

@@ -14,13 +14,14 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.exchange.export import Target
-from relay_autotune.loop.analysis import abscissae, inverted, step_responses
+from relay_autotune.loop.analysis import Loop, abscissae, inverted
 from relay_autotune.loop.gains import Controller, Gains
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.model_set import ModelSet
 from relay_autotune.quantities import Quantity, declared
 from relay_autotune.report.case import Case
 from relay_autotune.report.findings import performance_of
@@ -33,6 +34,7 @@ from relay_autotune.report.frequency import (
 from relay_autotune.result import Shaping
 from relay_autotune.tuning import DEFAULT_RULE, Designed, DesignOptions, designed, judged
 from relay_autotune.tuning.ensemble import ensemble_peaks
+from relay_autotune.tuning.task import DesignTask
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict
 
 # What the slider asks for: from calm to fast.
@@ -275,8 +277,8 @@ class PageModel:
         case, shaping = self.case, self.shaping
         if case.present is None or shaping is None or performance_of(case.present, case) is None:
             return None
-        model = shaping.task.in_loop(shaping.task.model)
-        return _steps(case.present, model, [], *self._scale(case.present))
+        loop = Loop(case.present, shaping.task.in_loop(shaping.task.model))
+        return _steps(loop, shaping.task, np.empty(0, dtype=bool), *self._scale(case.present))
 
     def case_with(self, shaped: DesignResult) -> Case:
         """Return the experiment with other recommended gains, as the report shows it.
@@ -329,19 +331,17 @@ def _shaped(
     scale: tuple[float, float],
 ) -> DesignResult:
     task = shaping.task
-    model = task.in_loop(task.model)
-    around: list[TransferFunction] = []
+    loop, steady = task.loop(gains), np.empty(0, dtype=bool)
     unstable = 0
     if task.models:
-        peaks = ensemble_peaks(gains, task.exact)
-        unstable = peaks.unstable
-        around = [m for m, ms in zip(task.around.models, peaks.ms, strict=True) if ms < math.inf]
+        peaks = ensemble_peaks(loop.law, task.around)
+        unstable, steady = peaks.unstable, peaks.ms < math.inf
     return DesignResult(
         asked,
         gains,
         judgement,
-        _steps(gains, model, around, *scale),
-        _curve(gains, model, shaping),
+        _steps(loop, task, steady, *scale),
+        _curve(gains, shaping),
         unstable,
         task.options,
     )
@@ -352,38 +352,37 @@ def _ms(k: int) -> float:
 
 
 def _steps(
-    gains: Controller,
-    model: TransferFunction,
-    around: list[TransferFunction],
-    half: float,
-    load: float,
+    loop: Loop, task: DesignTask, steady: NDArray[np.bool_], half: float, load: float
 ) -> Steps:
-    duration = 2.0 * half
-    setpoint, loaded = step_responses(gains, model, duration, _POINTS)
+    duration, law = 2.0 * half, loop.law
+    setpoint, loaded = loop.step_responses(duration, _POINTS)
     measurement, command = setpoint.measurement.copy(), setpoint.command.copy()
     measurement[_POINTS // 2 :] += load * loaded.measurement[: _POINTS // 2]
     command[_POINTS // 2 :] += load * loaded.command[: _POINTS // 2]
     low = high = np.empty(0)
-    if around:
+    if np.any(steady):
         # All models at once, each with both steps in one transform.
         s = abscissae(duration, _POINTS)
-        steps = (gains.from_setpoint(s) + load * np.exp(-half * s)) / s
-        processes = np.array([process(s) for process in around])
-        runs = inverted(processes / (1.0 + gains(s) * processes) * steps, duration)
+        steps = (law.from_setpoint(s) + load * np.exp(-half * s)) / s
+        moving = ModelSet(task.around.models)(s).T[steady]
+        runs = inverted(moving / (1.0 + law(s) * task.around(s).T[steady]) * steps, duration)
         low, high = np.quantile(runs, (0.025, 0.975), axis=0)
     return Steps(setpoint.time, measurement, command, low, high, half)
 
 
-def _curve(gains: Gains, model: TransferFunction, shaping: Shaping) -> LoopCurve:
-    loop = gains.loop(model)
-    w = loop_frequencies(loop)
+def _curve(gains: Gains, shaping: Shaping) -> LoopCurve:
+    task = shaping.task
+    loop = task.loop(gains)
+    w = loop_frequencies(gains.loop(task.in_loop(task.model)))
+    if loop.law.period > 0.0:
+        w = w[w * loop.law.period < math.pi]
     values = loop(1j * w)
     near = np.abs(values) < _FAR
     w, values = w[near], values[near]
     band: Sequence[FloatArray] = ()
-    if shaping.task.models and w.size > 2:
+    if task.models and w.size > 2:
         some = w[:: max(1, w.size // _BAND)]
-        around = gains(1j * some)[:, None] * shaping.task.around(some)
+        around = loop.law(1j * some)[:, None] * task.around.at(some)
         band = swept_parts(around[np.all(np.abs(around) < _FAR, axis=1)].T)
     return LoopCurve(values, band)
 

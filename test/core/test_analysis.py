@@ -15,9 +15,10 @@ from scipy import signal
 from scipy.integrate import trapezoid
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.analysis import analyse_loop, is_stable, step_responses
+from relay_autotune.loop.analysis import Loop, analyse_loop, is_stable
 from relay_autotune.loop.gains import Controller, InternalModelLaw
 from relay_autotune.loop.stability import closed_loop_unstable_poles, winding
+from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.structures import (
     INTEGRATOR_INVERSE,
     IPDT,
@@ -29,7 +30,6 @@ from relay_autotune.process.structures import (
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning.ensemble import ensemble_peaks
-from relay_autotune.tuning.task import ModelSet
 
 
 def _rational(control, controller: Controller, model: TransferFunction):
@@ -80,7 +80,7 @@ def test_responses_agree_with_scipy(control, controller, model):
     c, g = _rational(control, weighted, model)
     f = control.tf([weighted.kc * 0.4 * weighted.ti, weighted.kc], [weighted.ti, 0.0])
     for response, measurement, command in zip(
-        step_responses(weighted, model, 120.0, 1 << 14),
+        Loop(weighted, model).step_responses(120.0, 1 << 14),
         (g * f / (1 + c * g), g / (1 + c * g)),
         (f / (1 + c * g), -c * g / (1 + c * g)),
         strict=True,

@@ -12,7 +12,7 @@ import pytest
 from scipy.linalg import expm
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.analysis import noise_gain, open_noise_gain, step_responses
+from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.sampled import (
     Limits,
     SampledPid,
@@ -21,6 +21,7 @@ from relay_autotune.loop.sampled import (
 )
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import Controller, analyse_loop
+from relay_autotune.tuning.noise import open_noise_gain
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 PI, PID = Controller(0.67, 21.1), Controller(0.7, 16.0, 3.7, 0.37, 0.6)
@@ -29,7 +30,7 @@ PI, PID = Controller(0.67, 21.1), Controller(0.7, 16.0, 3.7, 0.37, 0.6)
 @pytest.mark.long
 @pytest.mark.parametrize("gains", [PI, PID])
 def test_the_responses_tend_to_the_continuous_ones(gains):
-    setpoint, load = step_responses(gains, MODEL, 400.0, 1 << 14)
+    setpoint, load = Loop(gains, MODEL).step_responses(400.0, 1 << 14)
     for continuous, step in ((setpoint, {"setpoint": 1.0}), (load, {"load": 1.0})):
         run = simulate_closed_loop(gains, MODEL, period=0.05, duration=200.0, **step)
         for name in ("measurement", "command"):
@@ -68,13 +69,12 @@ def test_within_its_limits_the_controller_does_not_wind_up():
 @pytest.mark.parametrize("period", [0.25, 1.0])
 def test_the_noise_in_the_command_is_what_was_predicted(period):
     noise = np.random.default_rng(1).standard_normal(3001)
-    held = TransferFunction.fopdt(1.65, 20.0, 10.0 + 0.5 * period)
     for gains in (PI, PID):
         run = simulate_closed_loop(
             gains, MODEL, period=period, duration=3000 * period, noise=noise
         )
         assert np.std(run.command[400:]) == pytest.approx(
-            noise_gain(gains, held, period), rel=0.06
+            analyse_loop(gains, MODEL, period).noise_gain, rel=0.06
         )
 
 

@@ -14,12 +14,13 @@ from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.loop.analysis import analyse_loop, is_stable
+from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate
 from relay_autotune.process.structures import UNSTABLE_FOPDT, UNSTABLE_SOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import design
 from relay_autotune.tuning.frontier import Bounds
 from relay_autotune.tuning.robust import robust
-from relay_autotune.tuning.search import NoiseLimit, Search
+from relay_autotune.tuning.search import Search
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 DESIGNS = cases("design.")
@@ -119,15 +120,29 @@ def test_pid_has_to_be_worth_its_derivative():
 
 
 def test_the_loop_of_the_controller_to_be_is_longer_by_its_period_and_delay():
-    model = TransferFunction.fopdt(1.0, 1.0, 0.5)
-    options = DesignOptions(controller="pi", sample_period=0.4, loop_delay=0.3)
-    slow, _ = robust(DesignTask(model=model, options=options))
-    whole, _ = robust(
-        DesignTask(
-            model=TransferFunction.fopdt(1.0, 1.0, 1.0), options=DesignOptions(controller="pi")
+    def gains(dead_time, **options):
+        model = TransferFunction.fopdt(1.0, 1.0, dead_time)
+        found, _ = robust(
+            DesignTask(model=model, options=DesignOptions(controller="pi", **options))
         )
+        return found.kc, found.ti
+
+    late = gains(0.5, sample_period=0.4, loop_delay=0.3)
+    assert late == pytest.approx(gains(0.8, sample_period=0.4), rel=1e-9)
+    # About a short period nothing but its half as dead time is left.
+    assert gains(0.5, sample_period=1e-2) == pytest.approx(gains(0.505), rel=1e-3)
+    assert gains(0.5, sample_period=1e-4) == pytest.approx(gains(0.50005), rel=1e-5)
+
+
+def test_no_gains_have_a_ti_that_a_sampled_controller_cannot_hold():
+    """A process that answers within a sample wants integral action, of which a part is kc."""
+    process, period = TransferFunction.fopdt(2.0, 1e-4, 1e-4), 0.1
+    gains = design(
+        DesignTask(model=process, options=DesignOptions(sample_period=period)), "robust"
     )
-    assert (slow.kc, slow.ti) == pytest.approx((whole.kc, whole.ti), rel=1e-9)
+    assert gains.ms == pytest.approx(1.4, rel=1e-2)
+    assert 0.02 * period < gains.ti < period
+    assert "in effect an integral controller" in gains.reason
 
 
 @pytest.mark.long
@@ -212,7 +227,7 @@ def test_gains_carry_what_the_user_must_know():
 
 def test_gains_that_no_filter_makes_quiet_enough_are_no_candidates():
     process = TransferFunction.fopdt(1.0, 10.0, 1.0)
-    search = Search(process, (), 10.0, NoiseLimit(1e-6, 1.0))
+    search = Search(process, (), 10.0, 1e-6, LawRate(LAWS[OWN_LAW], 1.0))
     found = search._at(Bounds(1.4, 1.4), np.zeros((3, 2)))
     assert np.all(np.isinf(found.tf)) and np.all(found.ki == -math.inf)
 

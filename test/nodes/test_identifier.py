@@ -19,9 +19,9 @@ from relay_autotune.cli.own_nodes import free_domain
 from relay_autotune.errors import ParameterError
 from relay_autotune.exchange.messages import fill_experiment
 from relay_autotune.identification.known import Known
+from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
-from relay_autotune.loop.sampled_loop import SampledLoop
 from relay_autotune.nodes.identifier import IdentifierNode
 from relay_autotune.nodes.identifier_parameters import KNOWN, PARAMETERS, known_from
 from relay_autotune.nodes.lifetime import Executor
@@ -125,7 +125,7 @@ def test_gains_are_for_the_law_of_the_parameter(
     (gains,) = told
     assert "for control_toolbox_legacy every 0.8 s" in gains.reason
     law = LAWS["control_toolbox_legacy"].at(Controller(gains.kc, gains.ti, gains.td), 0.8)
-    assert SampledLoop(law, PROCESS).ms() == pytest.approx(gains.ms, rel=1e-3)
+    assert Loop(law, PROCESS).ms() == pytest.approx(gains.ms, rel=1e-3)
 
 
 def test_progress_is_answered_with_what_is_sought(

@@ -24,7 +24,6 @@ import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.analysis import frequencies, is_stable, sensitivity_peaks
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.rules.applicability import (
@@ -197,11 +196,8 @@ def _choose(
     """Return the fastest lambda within the bound on Ms, and the least Ms of any."""
 
     def peak(log_lambda: float) -> float:
-        c = _gains(task, model, tau, late, math.exp(log_lambda), pid)
-        if not is_stable(c, model):
-            return _UNSTABLE
-        loop = c.loop(model)
-        return min(sensitivity_peaks(loop, frequencies(loop))[0], _UNSTABLE)
+        loop = task.loop(_gains(task, model, tau, late, math.exp(log_lambda), pid))
+        return min(loop.ms(), _UNSTABLE)
 
     grid = np.log(late * _LAMBDAS)
     peaks = [peak(float(x)) for x in grid]
