@@ -66,7 +66,9 @@ class DesignOptions:
         "Largest standard deviation of the noise in the command that derivative action may cause, "
         "as a fraction of the amplitude."
     )
-    filter_ratio: float = quantity(10.0, lower=0.0, open_ended=True).means("Largest td/tf.")
+    filter_ratio: float = quantity(10.0, lower=0.0, open_ended=True).means(
+        "Largest td/tf, to within half a sampling period over ti."
+    )
     closed_loop_time: float = quantity(
         math.nan, "s", lower=0.0, open_ended=True, flag="lambda"
     ).means("Lambda of imc, simc and unstable; NaN: the rule's own.")
