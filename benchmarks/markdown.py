@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -58,8 +57,14 @@ _MULTIPLE = "x reference"
 _CELL = re.compile(r"(?P<sign>[<>]=)? ?(?P<number>\d[\d,]*(\.\d+)?)")
 
 
+def _is_target(cell: str) -> bool:
+    return cell.startswith("target")
+
+
 def figures(text: str, naming: int) -> dict[tuple[str, ...], Figure]:
-    """Return the figures of all tables in a text that have a target in the next column.
+    """Return the figures of all tables in a text that have a target.
+
+    It stands in the next column, in the heading, or in a row below.
 
     :param text: with tables as `table` makes them.
     :param naming: number of columns at the beginning that name a row.
@@ -67,20 +72,27 @@ def figures(text: str, naming: int) -> dict[tuple[str, ...], Figure]:
     """
     found: dict[tuple[str, ...], Figure] = {}
     headings: list[str] = []
+    above: list[str] = []
     for line in text.splitlines():
         cells = [cell.strip() for cell in line.split("|")[1:-1]]
         if len(cells) != len(headings):
             headings = cells
-        for k, (value, target) in enumerate(pairwise(cells)):
-            figure, bound = _CELL.match(value), _CELL.match(target)
-            if headings[k + 1].startswith("target") and figure and bound and bound["sign"]:
-                multiple = _CELL.match(dict(zip(headings, cells, strict=True)).get(_MULTIPLE, ""))
+        # A target stands in the next column, in the heading, or in a row of its own below.
+        aimed = [(cells, k, t) for k, t in enumerate(cells[1:]) if _is_target(headings[k + 1])]
+        aimed += [(cells, k, h.partition("(target")[2]) for k, h in enumerate(headings)]
+        if cells and _is_target(cells[0]):
+            aimed = [(above, k, target) for k, target in enumerate(cells)]
+        for row, k, target in aimed:
+            figure, bound = _CELL.match(row[k]), _CELL.match(target.strip())
+            if figure and bound and bound["sign"]:
+                multiple = _CELL.match(dict(zip(headings, row, strict=True)).get(_MULTIPLE, ""))
                 stated, wanted, comparable = (
                     float(m["number"].replace(",", ""))
                     for m in (figure, bound, multiple or figure)
                 )
-                name = (*cells[:naming], headings[k])
+                name = (*row[:naming], headings[k])
                 found[name] = Figure(stated, wanted, bound["sign"] == ">=", comparable)
+        above = cells
     return found
 
 

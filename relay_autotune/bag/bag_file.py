@@ -33,6 +33,7 @@ from relay_autotune.bag.limits import (
     MOST_DECLARATIONS,
     MOST_DECLARED,
     MOST_NOTES,
+    MOST_SOUGHT,
     MOST_STEPS_OF_SQLITE,
     STEPS_OF_SQLITE_PER_BYTE,
 )
@@ -505,6 +506,7 @@ class SqliteFile(BagFile):
                 if len(str(text)) <= LARGEST_DEFINITION:
                     definitions[str(kind)] = (str(encoding), str(text).encode())
         channels: dict[int, Channel] = {}
+        sought = 0
         for number, *texts in self._rows(
             "SELECT id, name, type, serialization_format FROM topics"
         ):
@@ -516,8 +518,10 @@ class SqliteFile(BagFile):
             name, kind, encoding = (visible(str(text)) for text in texts)
             if not definitions.get(kind, ("", b""))[1]:
                 definitions[kind] = ("", b"")
+                sought += 1
                 with suppress(BagError):
-                    definitions[kind] = ("ros2msg", find_definition(kind).text.encode())
+                    if sought <= MOST_SOUGHT:
+                        definitions[kind] = ("ros2msg", find_definition(kind).text.encode())
             form, text = definitions[kind]
             channels[number] = Channel(number, name, kind, encoding, form, text, {})
         return channels

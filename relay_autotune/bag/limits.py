@@ -27,6 +27,9 @@ FREE_DISK = 256 << 20
 # Bytes of the definition of a message type: the largest of the common interfaces has 20 kB.
 LARGEST_DEFINITION = 256 << 10
 
+# Types without a definition in the file that are looked for among the installed packages.
+MOST_SOUGHT = 1000
+
 # Bytes of the definitions of a file that are read.
 MOST_DEFINITIONS = 8 << 20
 

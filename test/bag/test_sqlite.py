@@ -198,6 +198,22 @@ def test_many_topics_take_no_longer_and_are_not_paired(tmp_path):
     assert time.process_time() - begin < 10.0
 
 
+def test_types_without_number_are_not_all_looked_for_on_the_disk(tmp_path, monkeypatch):
+    path = bag(tmp_path / "a.db3")
+    database = sqlite3.connect(path)
+    database.execute(
+        "WITH RECURSIVE n(k) AS (SELECT 3 UNION ALL SELECT k + 1 FROM n WHERE k < 5000)"
+        " INSERT INTO topics SELECT k, '/t' || k, 'x_msgs/msg/T' || k, 'cdr', '' FROM n"
+    )
+    database.commit()
+    database.close()
+    sought = []
+    real = bag_file.find_definition
+    monkeypatch.setattr(bag_file, "find_definition", lambda k: sought.append(k) or real(k))
+    check(path)
+    assert len(sought) == 1000
+
+
 @pytest.mark.parametrize("begin", [bytes.fromhex("d9d505f920a163d7"), bytes(8)])
 def test_a_change_that_was_cut_is_said(tmp_path, begin):
     path = bag(tmp_path / "a.db3")

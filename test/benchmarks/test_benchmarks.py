@@ -150,6 +150,7 @@ SHORT = {
     "bag_reading": (("--part", "comparison", "--messages", "200000"), 1),
     "fit_time": (("--quick",), 3),
     "design_time": (("--quick",), 2),
+    "replay_time": (("--quick",), 1),
 }
 # How many times worse than in the file of results a figure may be, for the machine has other work.
 MOST_LOSS = 2.0
@@ -185,6 +186,17 @@ def test_a_table_that_is_no_longer_true_is_noticed() -> None:
     assert (time.value, time.target, time.is_met) == (1071.0, 10_000.0, True)
     (slower,) = markdown.figures(f"{heads}| b | 4,000 | <= 10,000 | 30 |", 1).values()
     assert slower.loss(time) == 1.5
+
+
+def test_a_target_may_stand_in_the_heading_or_in_a_row_below() -> None:
+    heads = "| jobs | [s] | faster (target >= 1.8) |\n|--|--|--|\n"
+    (found,) = markdown.figures(f"{heads}| 2 | 47.9 | 1.95 |", 1).items()
+    assert found[0] == ("2", "faster (target >= 1.8)")
+    assert (found[1].value, found[1].target, found[1].is_least) == (1.95, 1.8, True)
+    rows = "| median | | 1853 |\n| target | 0 | >= 2000 |"
+    (below,) = markdown.figures(f"| run | lost | rate |\n|--|--|--|\n{rows}", 1).items()
+    assert below[0] == ("median", "rate")
+    assert not below[1].is_met
 
 
 JUDGE = """
