@@ -64,6 +64,7 @@ class Shaping:
             ms_of=lambda models: ensemble_peaks(law, self.task.set_of(models)).ms,
             asked=max(self.task.options.ms, gains.ms),
             added_delay=self.task.options.added_delay,
+            pace_asked=self.task.options.given_closed_loop_time is not None,
         )
         found = judge(LOOP_CHECKS, self.evidence.with_loop(loop))
         return Judgement((*self.findings, *found))

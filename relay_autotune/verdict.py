@@ -44,12 +44,21 @@ class Result(enum.IntEnum):
 class Measured:
     """Measurement of a check on one experiment.
 
-    :param value: in the check's unit; NaN counts as beyond every limit.
-    :param detail: further text for the sentence, such as names; it replaces ``{detail}``.
+    :param value: in the check's unit; NaN: not known, which is doubtful.
+    :param detail: further text for the sentence, such as names; it replaces ``{detail}``. Of a
+        value that is not known: why.
     """
 
     value: float
     detail: str = ""
+
+
+def not_known(why: str) -> Measured:
+    """Return the measurement of a check that applies, but cannot be made: that is no pass.
+
+    :param why: what is missing, as the end of a sentence.
+    """
+    return Measured(math.nan, why)
 
 
 @dataclass(frozen=True)
@@ -87,16 +96,18 @@ class Check:
         if measured is None:
             return None
         value = measured.value
-        # Written so that NaN does not pass.
         result = Result.PASSED
-        if not value <= self.doubtful:
+        if value > self.doubtful or math.isnan(value):
             result = Result.DOUBTFUL
-        if not value <= self.failed:
+        if value > self.failed:
             result = Result.FAILED
         limit = self.failed if result is Result.FAILED else min(self.doubtful, self.failed)
         found = Finding(self.name, self.title, self.what, value, self.unit, limit, result)
         if result is Result.PASSED:
             return found
+        if math.isnan(value):
+            said = f"{self.title} could not be checked: {measured.detail}"
+            return replace(found, sentence=said, remedy=self.remedy)
         number = f"{value:g}" if math.isinf(value) else digits(value, 3)
         said = self.sentence.format(value=number, limit=digits(limit, 3), detail=measured.detail)
         return replace(found, sentence=said, remedy=self.remedy)

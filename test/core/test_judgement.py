@@ -19,7 +19,7 @@ from relay_autotune.identification.judgement.checks import (
     lost_effect,
     read_backward,
 )
-from relay_autotune.identification.judgement.evidence import Evidence, Loop, visible_error
+from relay_autotune.identification.judgement.evidence import Evidence, Loop, difference
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
@@ -48,7 +48,8 @@ def other_model(found, model):
     """Return what was identified with another model in its place."""
     own = found.estimate
     structure = GivenModel.of(model, found.parameters)
-    return replace(found, estimate=Estimate(structure, own.values, own.covariance))
+    estimate = Estimate(structure, own.values, own.covariance)
+    return replace(found, estimate=estimate, draws=(model,), halves=(), fitted=np.empty(0))
 
 
 def findings(record, model, gains, **more):
@@ -68,19 +69,31 @@ def gains(record):
     return analyse(record, alone=True).best_gains
 
 
-def test_the_visible_error_is_the_difference_of_two_processes(record):
+def shown_beside(model, record, w):
+    """Return mean and scatter of what a record shows beside a model."""
+    found = other_model(identify(record, "waveform"), model)
+    draws = difference(found, record).draws(w, 200)
+    return draws.mean(axis=0), draws.std(axis=0)
+
+
+def test_the_difference_is_that_of_two_processes(record):
     wrong = TransferFunction.fopdt(1.5, 10.0, 3.0)
-    w = np.array([0.05, 0.1, 0.2])
-    error = visible_error(wrong, record)
+    w = np.array([0.05, 0.1, 0.2, 0.4])
+    mean, scatter = shown_beside(wrong, record, w)
     truth = PROCESS(1j * w) - wrong(1j * w)
-    np.testing.assert_allclose(np.abs(error.at(w) - truth) / np.abs(truth), 0.0, atol=0.15)
-    assert np.all(error.sure(w) > 0.5 * np.abs(truth))
+    assert np.all(np.abs(mean - truth) < 0.1 * np.abs(truth) + 3.0 * scatter)
+    assert np.all(scatter < 0.2 * np.abs(truth))
 
 
-def test_the_right_model_has_no_visible_error(record):
+@pytest.mark.parametrize("pole", [0.0, 0.95])
+def test_beside_the_right_model_noise_of_any_colour_shows_next_to_nothing(record, pole):
+    rng, noise = np.random.default_rng(5), np.zeros(len(record))
+    for k in range(1, noise.size):
+        noise[k] = pole * noise[k - 1] + rng.normal(0.0, 0.02)
+    noisy = replace(record, measurement=record.measurement + noise)
     w = np.geomspace(0.03, 10.0, 100)
-    error = visible_error(PROCESS, record)
-    assert np.max(error.sure(w) / np.abs(PROCESS(1j * w))) < 0.2
+    mean, scatter = shown_beside(PROCESS, noisy, w)
+    assert np.max((np.abs(mean) + scatter) / np.abs(PROCESS(1j * w))[0]) < 0.1
 
 
 @pytest.mark.long
@@ -94,10 +107,41 @@ def test_the_right_model_has_no_visible_error(record):
         (TransferFunction.fopdt(2.0, 10.0, 25.0), False),
     ],
 )
-def test_a_response_that_is_not_the_models_makes_its_gains_doubtful(record, gains, model, passes):
-    found = findings(record, model, gains)["visible_response"]
+def test_a_response_that_is_not_the_models_is_a_risk_to_its_gains(record, gains, model, passes):
+    """The gains are those of the model, with the same margins on it in each case."""
+    scale = PROCESS.gain / model.gain
+    own = replace(gains, kc=gains.kc * scale)
+    found = findings(record, model, own)["risk"]
     assert (found.result is Result.PASSED) == passes
-    assert passes or "what the loop tolerates" in found.sentence
+
+
+def test_the_ms_with_a_difference_is_that_of_the_sum(gains):
+    w = np.geomspace(1e-3, 30.0, 4000)
+    for factor in (0.7, 1.3, 8.0):
+        other = replace(PROCESS, gain=factor * PROCESS.gain)
+        loop = Loop(gains, lambda ms: np.array([ms_on(gains, m) for m in ms]), gains.ms)
+        (found,) = loop.ms_with([PROCESS], w, (other(1j * w) - PROCESS(1j * w))[None, :])
+        truth = ms_on(gains, other)
+        # Of both, since the model alone may be right, too.
+        assert found == pytest.approx(max(truth, ms_on(gains, PROCESS)), rel=0.01)
+        assert math.isinf(found) == (factor > 2.0)
+
+
+def test_few_samples_are_no_evidence_for_gains(record, gains):
+    found = identify(record, "waveform")
+    some = replace(found, fitted=np.empty(0))
+    risk = of_checks(record.part(0, 50), some, gains)["risk"]
+    assert (risk.result, math.isnan(risk.value)) == (Result.DOUBTFUL, True)
+    assert "could not be checked: 50 samples show too little" in risk.sentence
+
+
+@pytest.mark.parametrize(("slower", "result"), [(1.0, Result.PASSED), (60.0, Result.DOUBTFUL)])
+def test_gains_far_slower_than_the_process_are_told(record, gains, slower, result):
+    late = replace(gains, ti=slower * gains.ti)
+    found = findings(record, PROCESS, late)["pace"]
+    # The integral of the error after a step is ti/(K kc), whatever else the loop does.
+    assert found.value == pytest.approx(late.ti / (2.0 * late.kc) / 13.0, rel=1e-3)
+    assert found.result is result
 
 
 @pytest.mark.long

@@ -26,7 +26,7 @@ from relay_autotune.verdict import NOT_JUDGED, Judgement, Result, Verdict, judge
         (1.5, Result.DOUBTFUL, Verdict.DOUBTFUL),
         (2.5, Result.FAILED, Verdict.NONE),
         (math.inf, Result.FAILED, Verdict.NONE),
-        (math.nan, Result.FAILED, Verdict.NONE),
+        (math.nan, Result.DOUBTFUL, Verdict.DOUBTFUL),
     ],
 )
 def test_the_verdict_is_that_of_the_worst_check(value, result, verdict):

@@ -54,18 +54,19 @@ def misfit(found: Identification, record: Record, *, noise: float | None = None)
     return residual / allowed if allowed > 0.0 else (math.inf if residual > 0.0 else 0.0)
 
 
-def unexplained_share(found: Identification, record: Record) -> float:
-    """Return the share of the measurement's variance that neither model nor noise explains.
+def unexplained_share(found: Identification, record: Record, residual: float) -> float:
+    """Return the share of the measurement's variance that neither response nor noise explains.
 
     What drift, past and load explain is no evidence for the model, and does not count.
 
     :param found: what was identified.
     :param record: the record.
+    :param residual: rms of what is not explained [y].
     """
     variance = float(np.var(record.measurement))
     if math.isfinite(found.to_explain):
         variance = min(variance, found.to_explain**2)
-    left = found.fit.residual_rms**2 - record.noise**2
+    left = residual**2 - record.noise**2
     return max(left, 0.0) / variance if variance > 0.0 else math.nan
 
 

@@ -3,12 +3,17 @@
 
 """What the checks look at: the record, the selected model, the models it allows, the gains.
 
-The record also shows the process without any structure. The model is simulated with the recorded
-command, from rest at an unknown constant command and without drift or load. Its residual is
-regressed on the past command: an impulse response in bins of the lag,
-``e(t) = c + sum_j g_j int u(t - lag) dlag`` over each bin. Its frequency response is the model's
-error (a model-error model, Ljung 1999): where it exceeds what the loop tolerates, the gains suit
-another process. A ridge keeps it at zero where the command excites nothing.
+No structure is true. What a record shows of the process beside the model is estimated without any
+structure (a model-error model, Ljung 1999): the residual of the simulation is regressed on the
+past command,
+
+    e(t) = sum_j g_j v_j(t) + nuisances + noise,
+
+with v_j the mean of the command over a bin of lags, so that g_j is an increment of the step
+response of the difference, and the noise an autoregression. The increments have a normal prior
+about zero that decays with the lag; its size is the most likely one (stochastic embedding:
+Goodwin, Gevers and Ninness 1992), which is zero where noise alone explains the residual. So the
+difference has draws, as the model has, and each process that the record allows is a draw of both.
 """
 
 from __future__ import annotations
@@ -23,92 +28,173 @@ import numpy as np
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.result import Identification
+from relay_autotune.identification.waveform.residuals import Colour, colour_of
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant, Record
 
-_BINS = 24
+_BINS = 48
 _MOST_COMPARED = 2000
-_LEAST_SAMPLES = 60
-# Share of the largest excitation below which the command excites nothing.
-_RIDGE = 1e-3
-# Number of standard deviations that chance explains.
-_SURE = 3.0
+LEAST_SAMPLES = 60
+# Responses of the model in which the prior decays.
+_DECAY = 3.0
+# Ratios of the powers of difference and noise, of which the most likely one is taken.
+_RATIOS = np.concatenate(([0.0], np.geomspace(1e-3, 1e12, 61)))
+_TURNS = 2
+# Shares below which a direction of the nuisances, and the square of one of the increments, are
+# those of rounding.
+_DEPENDENT, _ROUNDING = 1e-9, 1e-13
+_FREQUENCIES = 500
 
 
 @dataclass(frozen=True)
-class VisibleError:
-    """The difference between a record's response and a model's, without a structure.
+class Difference:
+    """The response that a record shows beside the model's, without a structure.
 
     :param edges: of the bins of the lag [s], shape (m + 1,).
-    :param height: impulse response of the difference in each bin [y/(u s)], shape (m,).
-    :param covariance: of the heights, shape (m, m).
-    :param residual: rms of what the difference does not explain either [y].
+    :param mean: increments of its step response [y/u], shape (m,).
+    :param root: of their covariance, shape (m, k).
+    :param residual: rms of what neither model nor difference explain [y].
     """
 
     edges: FloatArray
-    height: FloatArray
-    covariance: FloatArray
+    mean: FloatArray
+    root: FloatArray
     residual: float
 
-    def at(self, frequency: FloatArray) -> ComplexArray:
-        """Return its frequency response [y/u].
+    def draws(self, frequency: FloatArray, count: int) -> ComplexArray:
+        """Return frequency responses drawn from its posterior [y/u], shape (count, k).
 
         :param frequency: rad/s, shape (k,).
+        :param count: how many.
         """
-        return np.asarray(self._integrals(frequency) @ self.height)
-
-    def sure(self, frequency: FloatArray) -> FloatArray:
-        """Return its magnitude less what chance explains, at least zero [y/u].
-
-        :param frequency: rad/s, shape (k,).
-        """
-        basis = self._integrals(frequency)
-        variance = np.einsum("km,mn,kn->k", basis, self.covariance, basis.conj()).real
-        chance = _SURE * np.sqrt(np.maximum(variance, 0.0))
-        return np.maximum(np.abs(basis @ self.height) - chance, 0.0)
-
-    def _integrals(self, frequency: FloatArray) -> ComplexArray:
-        ends = np.exp(-1j * np.outer(frequency, self.edges))
-        return np.asarray((ends[:, :-1] - ends[:, 1:]) / (1j * frequency[:, None]))
+        normal = np.random.default_rng(0).standard_normal((count, self.root.shape[1]))
+        ends = np.exp(-1j * np.outer(self.edges, frequency))
+        bins = (ends[:-1] - ends[1:]) / np.outer(np.diff(self.edges), 1j * frequency)
+        return np.asarray((self.mean + normal @ self.root.T) @ bins)
 
 
-def visible_error(model: TransferFunction, record: Record) -> VisibleError | None:
-    """Return what a record shows of a model's error; None where it cannot tell.
+def difference(found: Identification, record: Record) -> Difference | None:
+    """Return the response that a record shows beside a model's; None where it cannot tell.
 
-    :param model: any; an unstable one cannot be simulated in open loop.
+    :param found: the model, and what was estimated with it: of that the two effects of the
+        command count, and the rest has a size of its own.
     :param record: the record.
     """
-    if model.grows or len(record) < _LEAST_SAMPLES:
+    model = found.model
+    if model.grows or len(record) < LEAST_SAMPLES:
         return None
-    u, time, y = record.input(), record.time, record.measurement
-    error = y - response(model, time, u)
-    few = np.unique(np.linspace(0, time.size - 1, min(time.size, _MOST_COMPARED)).astype(np.int64))
-    time, error = time[few], error[few]
-    shortest = max(float(np.median(np.diff(time))), 1e-6 * record.duration)
-    edges = np.concatenate(([0.0], np.geomspace(shortest, record.duration, _BINS)))
-    past = _integral(u, time[:, None] - edges)
-    columns = past[:, :-1] - past[:, 1:]
+    u = record.input()
+    few = np.unique(np.linspace(0, len(record) - 1, _MOST_COMPARED).astype(np.int64))
+    time = record.time[few]
+    away = u.values - u.initial
+    above, below = found.effects
+    acting = replace(u, values=u.initial + np.where(away > 0.0, above, below) * away)
+    answer = response(model, time, acting)
     # The measurement's zero and the command before the record are not known.
-    before = response(model, time, PiecewiseConstant(np.array([time[0]]), np.ones(1), 0.0))
-    unknown, _ = np.linalg.qr(np.stack((np.ones(time.size), before), axis=1))
-    columns = columns - unknown @ (unknown.T @ columns)
-    error = error - unknown @ (unknown.T @ error)
-    size = np.sqrt(np.einsum("nm,nm->m", columns, columns))
-    if not float(size.max()) > 0.0:
+    before = response(model, time, PiecewiseConstant(time[:1], np.ones(1), 0.0))
+    beside = [np.ones(time.size), before]
+    if len(found.fitted) == len(record):
+        beside.append(found.fitted[few] - answer)
+    left, nuisances = record.measurement[few] - answer, np.stack(beside)
+    known = np.isfinite(nuisances).all(axis=0)
+    if np.count_nonzero(known) < LEAST_SAMPLES:
         return None
-    size = np.maximum(size, _RIDGE * float(size.max()))
-    scaled = columns / size
-    normal = scaled.T @ scaled
-    inverse = np.linalg.inv(normal + _RIDGE * np.eye(normal.shape[0]))
-    height = inverse @ (scaled.T @ error)
-    left = error - scaled @ height
-    rms = math.sqrt(float(np.mean(left**2)))
-    # A residual that is correlated from sample to sample counts as fewer samples.
-    neighbours = float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-300)
-    colour = (1.0 + max(neighbours, 0.0)) / max(1.0 - neighbours, 1e-3)
-    covariance = rms**2 * colour * (inverse @ normal @ inverse) / np.outer(size, size)
-    return VisibleError(edges, height / size, covariance, rms)
+    # No bin is narrower than the time between samples, which tell nothing of what is within it.
+    shortest = max(float(np.median(np.diff(time))), 1e-6 * record.duration)
+    widths = np.geomspace(1.0, record.duration / shortest, _BINS)
+    edges = shortest * np.concatenate(([0.0], np.unique(np.round(widths))))
+    past = _integral(u, time[known, None] - edges)
+    moved = ((past[:, :-1] - past[:, 1:]) / np.diff(edges)).T
+    if not np.any(moved):
+        return None
+    whole = model.dead_time + sum(abs(t) for t in model.time_constants) or record.duration
+    lag = np.sqrt(np.maximum(edges[:-1], 0.5 * shortest) * edges[1:])
+    # An impulse response without jumps has increments as its bins are wide, which is as their lag,
+    # and alike where the lags are (a kernel of correlated decay, Chen, Ohlsson and Ljung 2012).
+    size = lag / whole * np.exp(-lag / (_DECAY * whole))
+    ratio = np.abs(np.subtract.outer(np.log(lag), np.log(lag)))
+    prior = size[:, None] * np.linalg.cholesky(np.exp(-ratio))
+    shown = _posterior(left[known], nuisances[:, known], moved, prior)
+    return Difference(edges, shown.mean, shown.root, math.sqrt(float(np.mean(shown.left**2))))
+
+
+@dataclass(frozen=True)
+class _Posterior:
+    """Increments of the difference in noise of one colour.
+
+    :param mean: of the increments, shape (m,).
+    :param root: of their covariance, shape (m, k).
+    :param left: what they and the nuisances leave [y], shape (n,).
+    :param unlikely: BIC of the samples with the most likely size of the prior.
+    """
+
+    mean: FloatArray
+    root: FloatArray
+    left: FloatArray
+    unlikely: float
+
+
+def _posterior(
+    left: FloatArray, nuisances: FloatArray, moved: FloatArray, prior: FloatArray
+) -> _Posterior:
+    """Return the posterior of increments in the most likely colour of the noise.
+
+    Noise and difference are estimated in turn (Cochrane and Orcutt 1949), once from noise that
+    explains all and once from a difference that does.
+
+    :param left: residual of the simulation [y], shape (n,).
+    :param nuisances: curves of any size, shape (p, n).
+    :param moved: responses to an increment each, shape (m, n).
+    :param prior: root of their relative covariance, shape (m, m).
+    """
+    basis = np.linalg.svd(nuisances, full_matrices=False)[2]
+    found = []
+    for colour in (colour_of([left - (left @ basis.T) @ basis]), None):
+        for _ in range(_TURNS):
+            found.append(_in_colour(colour, left, nuisances, moved, prior))
+            colour = colour_of([found[-1].left])
+    return min(found, key=lambda f: f.unlikely)
+
+
+def _in_colour(
+    colour: Colour | None,
+    left: FloatArray,
+    nuisances: FloatArray,
+    moved: FloatArray,
+    prior: FloatArray,
+) -> _Posterior:
+    def white(x: FloatArray) -> FloatArray:
+        return x if colour is None else colour.whitened(x)
+
+    aside = white(nuisances)
+    _, values, shapes = np.linalg.svd(aside, full_matrices=False)
+    basis = shapes[values > _DEPENDENT * values[0]]
+
+    def beside(x: FloatArray) -> FloatArray:
+        return x - (x @ basis.T) @ basis
+
+    free = beside(white(left))
+    rows, n = beside(white(prior.T @ moved)), free.size
+    squares, axes = np.linalg.eigh(rows @ rows.T)
+    known = squares > _ROUNDING * squares[-1]
+    axes, values = axes[:, known], np.sqrt(squares[known])
+    along = (axes.T @ (rows @ free)) / values
+    # Powers of the difference over those of the noise.
+    power = np.outer(_RATIOS, (values / values[-1]) ** 2)
+    total = float(free @ free) - np.sum(along**2 * power / (1.0 + power), axis=1)
+    noise = np.maximum(total, _ROUNDING * float(free @ free)) / n
+    unlikely = n * np.log(noise) + np.sum(np.log1p(power), axis=1)
+    k = int(np.argmin(unlikely))
+    size = math.sqrt(_RATIOS[k]) / values[-1]
+    reached = size**2 * values / (1.0 + power[k])
+    turned = prior @ axes
+    mean = turned @ (reached * along)
+    root = turned * (size * np.sqrt(noise[k] / (1.0 + power[k])))
+    rest = left - mean @ moved
+    rest = rest - np.linalg.lstsq(aside.T, white(rest), rcond=None)[0] @ nuisances
+    cost = 0.0 if colour is None else colour.log_determinant + colour.order * math.log(n)
+    return _Posterior(mean, root, rest, float(unlikely[k]) + cost)
 
 
 def _integral(u: PiecewiseConstant, at: FloatArray) -> FloatArray:
@@ -134,12 +220,45 @@ class Loop:
     :param ms_of: Ms of the loops that these gains make with models; inf: unstable.
     :param asked: Ms that was asked of the gains, or theirs on the model where that is larger.
     :param added_delay: dead time of the loop beside the process's own [s].
+    :param pace_asked: True: how fast the loop is was asked for.
     """
 
     controller: Callable[[ComplexArray], ComplexArray]
     ms_of: Callable[[Sequence[TransferFunction]], FloatArray]
     asked: float
     added_delay: float = 0.0
+    pace_asked: bool = False
+
+    def sensitivity(self, model: TransferFunction, w: FloatArray) -> ComplexArray:
+        """Return ``1/(1 + L)`` with a model.
+
+        :param model: any.
+        :param w: frequencies [rad/s], shape (k,).
+        """
+        process = model(1j * w) * np.exp(-1j * w * self.added_delay)
+        return np.asarray(1.0 / (1.0 + process * self.controller(1j * w)))
+
+    def ms_with(
+        self, models: Sequence[TransferFunction], w: FloatArray, differences: ComplexArray
+    ) -> FloatArray:
+        """Return Ms with models to each of which a stable difference is added; inf: unstable.
+
+        With S the sensitivity on a model and D its difference, that of the sum is
+        ``S/(1 + D C S)``. Where S is stable, the sum is if ``1 + D C S`` turns around zero as
+        often as not at all.
+
+        :param models: m of them.
+        :param w: rad/s, shape (k,).
+        :param differences: frequency responses [y/u], shape (m, k).
+        """
+        own = self.ms_of(models)
+        law = self.controller(1j * w) * np.exp(-1j * w * self.added_delay)
+        found = np.array([self.sensitivity(m, w) for m in models])
+        moved = 1.0 + differences * law * found
+        phase = np.unwrap(np.angle(np.column_stack((moved, np.ones(len(models))))), axis=1)
+        turns = np.abs(phase[:, -1] - phase[:, 0]) > math.pi
+        peak = np.max(np.abs(found / moved), axis=1)
+        return np.where(turns | np.isinf(own), math.inf, np.maximum(own, peak))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,16 +282,22 @@ class Evidence:
         :param loop: the gains.
         """
         found = replace(self, loop=loop)
-        found.__dict__["visible"] = self.visible
+        found.__dict__["difference"] = self.difference
         return found
 
     @cached_property
-    def visible(self) -> VisibleError | None:
-        """What the record shows of the model's error; None where it cannot tell."""
+    def difference(self) -> Difference | None:
+        """What the record shows beside the model; None where it cannot tell."""
         try:
-            return visible_error(self.found.model, self.record)
+            return difference(self.found, self.record)
         except (ModelError, np.linalg.LinAlgError):
             return None
+
+    @property
+    def frequencies(self) -> FloatArray:
+        """Frequencies of which a record of this length and interval tells [rad/s]."""
+        lowest, highest = 0.5 / self.record.duration, 4.0 / self.record.mean_interval
+        return math.pi * np.geomspace(lowest, highest, _FREQUENCIES)
 
     def growth(self, model: TransferFunction) -> float:
         """Return the longest time of a constant command in time constants of a model's growth.

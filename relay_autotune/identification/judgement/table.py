@@ -20,16 +20,25 @@ from relay_autotune.identification.judgement.checks import (
     lost_effect,
     read_backward,
 )
-from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence, Loop
+from relay_autotune.identification.judgement.evidence import (
+    LEAST_SAMPLES,
+    MOST_GROWTH,
+    Evidence,
+    Loop,
+)
 from relay_autotune.identification.result import NOT_AT_REST
-from relay_autotune.identification.waveform.starts import latest_dead_time
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.text import digits
-from relay_autotune.verdict import Check, Measured
+from relay_autotune.verdict import Check, Measured, not_known
 
-_FREQUENCIES = 300
 # Ms over the asked one from which gains are bad on a model.
 _FAR_ABOVE = 1.25
+# Frequency at which the integral action alone is left, times the record's duration [rad].
+_LOW = 1e-6
+# Least number of draws of a model and a difference.
+_DRAWN = 100
+# Share of bad ones from which gains are more likely bad than good.
+_LIKELY_BAD = 0.5
 # The same for a half of a record, which tells less: it has to contradict the gains.
 _IN_HALF = 2.0
 
@@ -37,15 +46,6 @@ _IN_HALF = 2.0
 def _fed_back(evidence: Evidence) -> Measured | None:
     share = read_backward(evidence.record, evidence.found.model)
     return None if share is None else Measured(share)
-
-
-def _first_response(evidence: Evidence) -> Measured | None:
-    record, model = evidence.record, evidence.found.model
-    # In a relay test a load may come before the response, and the cycles show the dead time.
-    if record.settings is not None:
-        return None
-    latest = latest_dead_time(record.time, record.measurement, record.drive(), model.process_sign)
-    return Measured(model.dead_time / latest) if math.isfinite(latest) else None
 
 
 def _resolution(evidence: Evidence) -> Measured | None:
@@ -64,9 +64,10 @@ def _residual(evidence: Evidence) -> Measured | None:
 
 
 def _share(evidence: Evidence) -> Measured | None:
-    if math.isnan(evidence.found.fit.residual_rms):
-        return None
-    return Measured(unexplained_share(evidence.found, evidence.record))
+    found, difference = evidence.found, evidence.difference
+    # What a response beside the model's explains is in the risk.
+    left = found.fit.residual_rms if difference is None else difference.residual
+    return None if math.isnan(left) else Measured(unexplained_share(found, evidence.record, left))
 
 
 def _limit_cycle(evidence: Evidence) -> Measured | None:
@@ -88,23 +89,24 @@ def _growth(evidence: Evidence) -> Measured | None:
     return Measured(growth) if growth > 0.0 else None
 
 
-def _visible(evidence: Evidence) -> Measured | None:
-    loop, error = evidence.loop, evidence.visible
-    if loop is None or error is None:
-        return None
-    record, model = evidence.record, evidence.found.model
-    interval = record.mean_interval
-    w = np.geomspace(2.0 * math.pi / record.duration, math.pi / interval, _FREQUENCIES)
-    process = model(1j * w) * np.exp(-1j * w * loop.added_delay)
-    tolerance = np.abs(loop.controller(1j * w) / (1.0 + process * loop.controller(1j * w)))
-    share = error.sure(w) * tolerance
-    at = int(np.argmax(share))
-    return Measured(float(share[at]), f"{w[at]:.3g} rad/s")
-
-
 def _risk(evidence: Evidence) -> Measured | None:
-    loop, draws = evidence.loop, evidence.found.draws
-    return Measured(_bad(loop, draws, _FAR_ABOVE)) if loop is not None and draws else None
+    loop, found, difference = evidence.loop, evidence.found, evidence.difference
+    if loop is None:
+        return None
+    models = found.draws or (found.model,)
+    if difference is not None:
+        w = evidence.frequencies
+        models = models * (_DRAWN // len(models) + 1)
+        ms = loop.ms_with(models, w, difference.draws(w, len(models)))
+    elif found.draws:
+        ms = loop.ms_of(models)
+    else:
+        return None
+    share = float(np.mean(ms > _FAR_ABOVE * loop.asked))
+    n = len(evidence.record)
+    if share <= _LIKELY_BAD and n < LEAST_SAMPLES:
+        return not_known(f"{n} samples show too little of the process; {LEAST_SAMPLES} are needed")
+    return Measured(share)
 
 
 def _bad(loop: Loop, models: Sequence[TransferFunction], times: float) -> float:
@@ -113,6 +115,18 @@ def _bad(loop: Loop, models: Sequence[TransferFunction], times: float) -> float:
     A process of the other direction makes the loop unstable.
     """
     return float(np.mean(loop.ms_of(models) > times * loop.asked))
+
+
+def _pace(evidence: Evidence) -> Measured | None:
+    loop, model = evidence.loop, evidence.found.model
+    if loop is None or loop.pace_asked or model.integrators or model.grows:
+        return None
+    # After a step the error lasts 1/(K k_i), whatever else the loop does; by itself the process
+    # takes its dead time and the time constants of its decays.
+    low = _LOW / evidence.record.duration
+    lasting = 1.0 / (abs(model.gain) * low * float(abs(loop.controller(np.array([1j * low]))[0])))
+    alone = model.dead_time + sum(1.0 / (1.0 / t).real for t in model.time_constants)
+    return Measured(lasting / alone) if alone > 0.0 else None
 
 
 def _halves(evidence: Evidence) -> Measured | None:
@@ -152,8 +166,13 @@ def _direction(evidence: Evidence) -> Measured | None:
 
 
 def _left_out(evidence: Evidence) -> Measured | None:
-    fitted = evidence.found.fitted
-    return Measured(float(np.isnan(fitted).mean())) if len(fitted) else None
+    fitted, record, used = evidence.found.fitted, evidence.record, 1.0
+    if record.unthinned is not None:
+        # Of a long record with fast responses only a part is looked at.
+        before = record.unthinned
+        used = min(record.duration / (before.samples * before.interval), 1.0)
+    share = float(np.isnan(fitted).mean()) if len(fitted) else 0.0
+    return Measured(1.0 - used * (1.0 - share))
 
 
 def _clipped(evidence: Evidence) -> Measured | None:
@@ -191,19 +210,6 @@ MODEL_CHECKS = (
         remedy="move the set-point while recording, or let a relay work in place of the "
         "controller",
         measure=_fed_back,
-    ),
-    Check(
-        name="first_response",
-        title="First response",
-        what="dead time of the model over twice the time from the first change of the command to "
-        "the first visible response",
-        unit="",
-        doubtful=1.0,
-        failed=3.0,
-        sentence="the measurement moves before the model does: its dead time is {value} times the "
-        "longest that the first visible response allows",
-        remedy="use the method waveform, or name the dead time",
-        measure=_first_response,
     ),
     Check(
         name="resolution",
@@ -244,8 +250,8 @@ MODEL_CHECKS = (
     Check(
         name="explained",
         title="Fit",
-        what="share of the measurement's variance beside drift, past and load that neither model "
-        "nor noise explains",
+        what="share of the measurement's variance beside drift, past and load that neither a "
+        "response to the command nor noise explains",
         unit="",
         doubtful=0.1,
         failed=0.5,
@@ -256,11 +262,11 @@ MODEL_CHECKS = (
     Check(
         name="left_out",
         title="Left out",
-        what="share of the samples that the model was not fitted to, since no model fits them "
-        "together with the others",
+        what="share of the record that the model was not fitted to, since no model fits it "
+        "together with the rest, or only a part of a long record was looked at",
         unit="",
         doubtful=0.5,
-        sentence="{value} of the record is left out as disturbed: the model rests on the others",
+        sentence="{value} of the record is left out: the model rests on the others",
         remedy="repeat the test while nothing else acts on the process, on a computer with time "
         "for it",
         measure=_left_out,
@@ -296,11 +302,12 @@ LOOP_CHECKS = (
     Check(
         name="risk",
         title="Risk",
-        what="share of the models that the record allows on which the gains are unstable or have "
-        "an Ms of more than 1.25 times what was asked",
+        what="share of the processes that the record allows, each a model and what the record "
+        "shows beside it, on which the gains are unstable or have an Ms of more than 1.25 times "
+        "what was asked",
         unit="",
         doubtful=0.1,
-        failed=0.5,
+        failed=_LIKELY_BAD,
         sentence="on {value} of the models that the record allows the loop is unstable or nearly "
         "so",
         remedy="run more cycles, use a larger amplitude, or record a longer test",
@@ -319,17 +326,16 @@ LOOP_CHECKS = (
         measure=_halves,
     ),
     Check(
-        name="visible_response",
-        title="Visible response",
-        what="difference between the model and the response that the record shows without any "
-        "structure, over what the loop tolerates (1: it may be unstable), at the worst frequency",
+        name="pace",
+        title="Pace",
+        what="integral of the error after a step of the set-point, over the time that the process "
+        "takes by itself",
         unit="",
-        doubtful=0.6,
-        sentence="the record shows another response than the model's: at {detail} the difference "
-        "is {value} of what the loop tolerates",
-        remedy="look at the model over the data; name another structure, or record from rest "
-        "without other inputs",
-        measure=_visible,
+        doubtful=5.0,
+        sentence="with these gains an error lasts {value} times as long as the process takes by "
+        "itself, since they have to hold on all models that the record allows",
+        remedy="test with a larger amplitude or more cycles, or on a process at rest",
+        measure=_pace,
     ),
 )
 
