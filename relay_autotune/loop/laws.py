@@ -459,8 +459,8 @@ class SampledLaw:
         """Total variation of the command by the derivative of the error after a unit step."""
         if self.law.slope is not Slope.ERROR or self.gains.td == 0.0:
             return 0.0
-        taps = np.array(taps_of(self.derivative, self.gains.tf, self.period))
-        return float(np.abs(np.diff(taps, prepend=0.0, append=0.0)).sum())
+        # The steps of its response are the response to an impulse.
+        return float(np.abs(taps_of(self.derivative, self.gains.tf, self.period)).sum())
 
     def characteristic(self, model: TransferFunction) -> tuple[TransferFunction, ...]:
         """Return the terms L_k of the characteristic equation of the continuous loop."""
