@@ -101,7 +101,8 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         warnings=warnings,
         fitted=_fitted(records, fit, residual),
     )
-    gain_std, frequency_std = point_stds(found, allowed.mixture)
+    # One of each opposite pair: the other one has the same square.
+    gain_std, frequency_std = point_stds(found, allowed.mixture[::2])
     error = gain_std / abs(found.ultimate_gain)
     notes = [disagreeing_point(record, found.model, error) for record in records]
     found = replace(found, warnings=(*found.warnings, *dict.fromkeys(n for n in notes if n)))

@@ -360,7 +360,7 @@ def _backward(r: list[list[float]], right: list[float]) -> FloatArray:
 
 def refine(
     problem: Problem,
-    theta: FloatArray,
+    start: FloatArray | Trial,
     *,
     tolerance: float = _LEAST_GAIN,
     most: int = _MOST_ITERATIONS,
@@ -369,12 +369,15 @@ def refine(
     """Return the least sum of squares near a theta.
 
     :param problem: the problem.
-    :param theta: where to begin, shape (m,).
+    :param start: theta, shape (m,), or an earlier fit to the same problem, which goes on.
     :param tolerance: relative gain below which a step is the last one; by default, rounding.
     :param most: largest number of steps that are tried.
-    :param damping: Marquardt's damping at the start; that of an earlier fit continues it.
+    :param damping: Marquardt's damping at the start.
     """
-    state = evaluate(problem, theta)
+    if isinstance(start, Trial):
+        state, damping = start, start.damping
+    else:
+        state = evaluate(problem, start)
     growth = _GROWTH
     longest = _LONGEST * float(np.ptp(problem.time))
     # A rough answer must not take as many trials as an exact one.

@@ -234,17 +234,19 @@ def multistart(
     :param least: mean square of the best structure so far, in squares of the range: a fit that
         will not come near it is given up.
     """
-    few, reached = coarse(problem), [evaluate(coarse(problem), theta) for theta in thetas]
+    few = coarse(problem)
+    bound = _HOPELESS * max(least, _CLEAN) * few.time.size
+    reached: list[Trial] = []
+    starts: Sequence[FloatArray | Trial] = thetas
     for steps, count in _ROUNDS:
-        reached = [
-            refine(few, s.theta, tolerance=_COARSE, most=steps, damping=s.damping)
-            for s in reached[:count]
-        ]
-        reached = _apart_from_each_other(problem, reached)
-        if not reached:
+        reached = [refine(few, s, tolerance=_COARSE, most=steps) for s in starts[:count]]
+        starts = reached = _apart_from_each_other(problem, reached)
+        if not reached or min(predicted_cost(few, s) for s in reached) > bound:
             return None
-        predicted = min(predicted_cost(few, s) for s in reached)
-        if predicted > _HOPELESS * max(least, _CLEAN) * few.time.size:
+    if reached[0].cost > bound:
+        # It may not have converged yet.
+        reached = [refine(few, reached[0], tolerance=TRIAL)]
+        if reached[0].cost > bound:
             return None
     last = [s for s in reached if s.cost <= _UNDECIDED * reached[0].cost][:2]
     fits = [refine(problem, s.theta, tolerance=tolerance, damping=s.damping) for s in last]
