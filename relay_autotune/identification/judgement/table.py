@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from relay_autotune.identification.judgement.assessment import misfit, unexplained_share
+from relay_autotune.identification.judgement.assessment import unexplained_share
 from relay_autotune.identification.judgement.checks import (
     lost_effect,
     read_backward,
@@ -52,15 +52,6 @@ def _resolution(evidence: Evidence) -> Measured | None:
     model = evidence.found.model
     answer = model.dead_time + sum(abs(t) for t in model.time_constants)
     return Measured(evidence.record.interval / answer) if answer > 0.0 else None
-
-
-def _residual(evidence: Evidence) -> Measured | None:
-    # Only noise measured at rest counts: noise may have any colour, and second differences show
-    # its fast part alone.
-    if not math.isfinite(evidence.record.noise_std):
-        return None
-    value = misfit(evidence.found, evidence.record)
-    return None if math.isnan(value) else Measured(value)
 
 
 def _share(evidence: Evidence) -> Measured | None:
@@ -233,19 +224,6 @@ MODEL_CHECKS = (
         "{value} time constants, and the record did not",
         remedy="name a stable structure, or record the controller's command if a loop was closed",
         measure=_growth,
-    ),
-    Check(
-        name="residual",
-        title="Residual",
-        what="residual over the larger of 1.3 times the noise at rest and 2 % of the "
-        "measurement's spread",
-        unit="",
-        doubtful=4.0,
-        sentence="the residual is {value} times the largest one that noise and a simple structure "
-        "explain",
-        remedy="look at the residual in the report: what repeats with the command is not in the "
-        "model, what comes once is a disturbance",
-        measure=_residual,
     ),
     Check(
         name="explained",
