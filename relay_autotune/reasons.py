@@ -296,12 +296,6 @@ class Code(enum.IntEnum):
         "The amplitude is too small, the actuator does not follow, or the process is slower than "
         "ten minutes: give settle_time or max_duration then.",
     )
-    PULSE_FADES = _Row(
-        123,
-        "no response to the kick: what looked like one left nothing behind",
-        "give a larger amplitude",
-        "Noise looked like a response, again and again.",
-    )
 
     # The relay switches, and there is no limit cycle.
     NO_ANSWER = _Row(
@@ -684,18 +678,17 @@ class Code(enum.IntEnum):
         "identifier_node has too much to do.",
         transient=True,
     )
+    NOT_ANALYSED = _Row(
+        901,
+        "the record could not be analysed: {why}",
+        meaning="A defect of ours: report the sentence, with the recording if you can.",
+    )
     CHECK_FAILED = _Row(
         402,
         "{sentence}",
         "",
         "A check of the verdict did not pass: its name, number and limit are among the values; "
         "see the guide's page on the verdict.",
-    )
-    NO_GAINS = _Row(
-        403,
-        "no gains: {why}",
-        "",
-        "No rule applies to this process, or the verdict is none: tune --table shows each rule.",
     )
 
     # A verification.
@@ -781,9 +774,6 @@ class Code(enum.IntEnum):
         "set the parameter accept_doubtful to true to step all the same",
         "A doubtful model predicts no step.",
         "accept_doubtful true",
-    )
-    BAD_STEP = _Row(
-        514, "{sentence}", meaning="The step is not given, too large, or not possible."
     )
     NOT_AUTOMATIC = _Row(
         515,

@@ -26,6 +26,7 @@ from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import transfer_function_from_message
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
+from relay_autotune.reasons import Code
 from relay_autotune.text import LOGGED_EVERY, digits, duration, in_units
 from relay_autotune.verdict import Verdict
 
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 # By the constants of Tune.Feedback and RelayExperiment.
 STATES = ("unknown", "settling", "kick", "relay", "completed", "aborted", "failed")
 OUTCOMES = ("unknown", "completed", "aborted", "failed")
+# Reasons whose sentence begins with the outcome.
+_OUTCOME_OF = {Code.CANCELLED: "cancelled", Code.REQUESTED: "aborted"}
 
 # Time between two updates of a terminal [s].
 TICK = 0.25
@@ -193,7 +196,7 @@ def result_lines(
     """
     outcome = "cancelled" if cancelled else OUTCOMES[result.outcome]
     colour = {"completed": _GREEN}.get(outcome, _RED)
-    repeats = result.reason.startswith(outcome)
+    repeats = _OUTCOME_OF.get(result.why.code) == outcome
     told = result.reason if repeats else f"{outcome}: {result.reason}"
     first, *rest = labelled("tune", told, columns)
     lines = [first.replace(outcome, paint(outcome, f"{_BOLD};{colour}"), 1), *rest]

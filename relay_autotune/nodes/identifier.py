@@ -17,6 +17,7 @@ from relay_autotune.analysis import RunningFit, Task, analyse, analyse_jointly, 
 from relay_autotune.errors import RelayAutotuneError, defect
 from relay_autotune.exchange.messages import (
     fill_gains,
+    fill_reason,
     fill_transfer_function,
     record_from_cycles,
     record_from_message,
@@ -31,6 +32,7 @@ from relay_autotune.nodes.identifier_parameters import PARAMETERS, task_from
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.parameters import ask_before_changes, declare, merged, values_of
 from relay_autotune.nodes.results import Refusals, SignsOfLife
+from relay_autotune.reasons import Code, Reason, other, reason_of
 from relay_autotune.record.record import Outcome, Record
 from relay_autotune.result import Analysis
 from relay_autotune.verdict import Judgement
@@ -131,27 +133,25 @@ class IdentifierNode(ServedNode):
         """Answer with every method's model and every rule's gains for a record."""
         values = values_of(self, PARAMETERS)
         if len(self._waiting) >= _MOST_WAITING:
-            response.reason = f"{_MOST_WAITING} other records wait: ask again later"
-            return response
+            return _answered(response, Code.QUEUE_FULL(waiting=_MOST_WAITING))
         try:
             record = record_from_message(request.experiment)
             values["method"] = request.method or values["method"]
             values["rule"] = request.rule or values["rule"]
             work = partial(analyse, record, **vars(task_from(values)))
         except RelayAutotuneError as error:
-            response.reason = str(error)
-            return response
+            return _answered(response, reason_of(error))
         done: Future = Future(executor=self.executor)
         self._wait_for(work, done.set_result)
         found = await done
         if isinstance(found, Exception):
-            response.reason = (
-                str(found)
-                if isinstance(found, RelayAutotuneError)
-                else f"the record could not be analysed: {defect(found)}"
+            known = isinstance(found, RelayAutotuneError)
+            return _answered(
+                response,
+                reason_of(found) if known else Code.NOT_ANALYSED(why=defect(found)),
             )
-            return response
-        response.success, response.reason = found.model is not None, found.reason
+        response.success = found.model is not None
+        _answered(response, other(found.reason))
         # Only the selected model was judged.
         for number, identification in enumerate(found.models):
             judgement = found.judgement if number == found.selected else None
@@ -275,6 +275,13 @@ class IdentifierNode(ServedNode):
                 f"{identification.method}, gain {identification.model.gain:.6g}, "
                 f"dead time {identification.model.dead_time:.6g} s"
             )
+
+
+def _answered(response: Any, why: Reason) -> Any:
+    """Return an answer with its reason."""
+    response.reason = str(why)
+    fill_reason(response.why, why)
+    return response
 
 
 def _model_message(

@@ -35,9 +35,11 @@ from relay_autotune.cli.tune_view import (
 )
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.identifier_parameters import known_from, options_from
+from relay_autotune.reasons import Code
 from relay_autotune.text import duration
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
+from relay_autotune_msgs.msg import Reason as ReasonMessage
 
 NAN = math.nan
 
@@ -304,7 +306,8 @@ def test_a_report_of_a_tune_is_what_the_identifier_would_say(monkeypatch, tmp_pa
 
 
 def test_a_tune_without_gains_offers_none() -> None:
-    stopped = result(outcome=Tune.Result.ABORTED, reason="cancelled", bag="/records/x")
+    why = ReasonMessage(code=Code.CANCELLED)
+    stopped = result(outcome=Tune.Result.ABORTED, reason="cancelled", why=why, bag="/records/x")
     text = "\n".join(result_lines(stopped, True, Paint()))
     assert "cancelled" in text and "cancelled: cancelled" not in text
     assert "safe command; no gains are given" in text
@@ -314,7 +317,8 @@ def test_a_tune_without_gains_offers_none() -> None:
 
 def test_a_reason_that_begins_with_the_outcome_does_not_repeat_it() -> None:
     reason = "cancelled; 3 samples repeat the one before, since the sensor was silent"
-    stopped = result(outcome=Tune.Result.ABORTED, reason=reason, bag="/records/x")
+    why = ReasonMessage(code=Code.CANCELLED)
+    stopped = result(outcome=Tune.Result.ABORTED, reason=reason, why=why, bag="/records/x")
     assert result_lines(stopped, True, Paint())[0].split(maxsplit=1) == ["tune", reason]
 
 
