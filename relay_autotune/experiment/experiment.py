@@ -122,6 +122,7 @@ class RelayExperiment:
             parameters, self.baseline, until_converged, self._levels, self._trace, self._notes
         )
         self._phase: Phase = Settle(self._setup, before)
+        self._relay: Switching | None = None
         self._facts = Facts(sign=parameters.process_gain_sign)
         self._why = NONE
         self._policy = policy
@@ -132,10 +133,6 @@ class RelayExperiment:
         self._origin = math.nan
 
     # What is known of it.
-
-    @property
-    def _relay(self) -> Switching | None:
-        return self._phase if isinstance(self._phase, Switching) else None
 
     @property
     def facts(self) -> Facts:
@@ -349,8 +346,9 @@ class RelayExperiment:
         if isinstance(found, Left):
             self._facts = found.facts
             self.state, begin = _TRANSITIONS[self.state, found.event]
-            self._phase = begin(self._setup, found.facts)
-            found = self._phase.command
+            self._phase = phase = begin(self._setup, found.facts)
+            self._relay = phase if isinstance(phase, Switching) else None
+            found = phase.command
         if isinstance(found, Ended):
             command = self._end(found, y)
         elif self.parameters.command_rate > 0.0:
@@ -421,13 +419,12 @@ class RelayExperiment:
 
     def _passes_limit(self, t: float, y: float) -> Ended | None:
         """Return the end of the experiment if the last sample passes a limit."""
-        p, facts = self.parameters, self.facts
+        p = self.parameters
         low, high = p.measurement_min, p.measurement_max
         if not low <= y <= high:
             why = Code.OUTSIDE_LIMITS(value=y, time=t, low=low, high=high)
             return Ended(State.ABORTED, why)
-        away = abs(y - facts.setpoint) if p.max_deviation > 0.0 else 0.0
-        if away > p.max_deviation:
+        if p.max_deviation > 0.0 and (away := abs(y - self.facts.setpoint)) > p.max_deviation:
             why = Code.TOO_FAR(value=y, time=t, away=away, most=p.max_deviation)
             return Ended(State.ABORTED, why)
         if 0.0 < p.max_duration < t:
