@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from relay_autotune.analysis import RunningFit, Task, analyse, model_so_far
 from relay_autotune.experiment.early_end import MS, ULTIMATE_GAIN, EarlyEnd, FitProgress
 from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.samples import Facts
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
@@ -30,9 +31,9 @@ class Progress:
     """An experiment as far as the early end asks for it."""
 
     elapsed: float = 10.0
-    kicked_at: float = 2.0
     switches: int = 2
     cycle_count: int = 0
+    facts: Facts = field(default_factory=lambda: Facts(sign=1, kicked_at=2.0))
 
 
 def _known_to(width: float) -> FitProgress:
@@ -63,7 +64,7 @@ def test_between_switches_it_waits_for_an_answer_and_longer_the_wider_the_interv
     early.look(Progress(elapsed=12.0))
     much_later = Progress(elapsed=1000.0)
     assert not early.is_due(much_later)
-    assert early.judge(much_later, _known_to(width)) == ""
+    assert early.judge(much_later, _known_to(width)) is None
     # Ten seconds after the kick; an interval as T^-3 would be narrow enough no earlier.
     earliest = 10.0 * min(max((width / 0.02) ** (1.0 / 3.0), 1.02), 1.15)
     assert not early.is_due(Progress(elapsed=2.0 + 0.999 * earliest))
@@ -82,17 +83,17 @@ def test_between_switches_it_waits_for_an_answer_and_longer_the_wider_the_interv
     ],
 )
 def test_what_is_not_known_well_enough_ends_nothing(found):
-    assert EarlyEnd(ULTIMATE_GAIN, 0.02).judge(Progress(), found) == ""
+    assert EarlyEnd(ULTIMATE_GAIN, 0.02).judge(Progress(), found) is None
 
 
 def test_the_reason_names_what_was_sought():
-    assert "K_u is within 0.0199 of it" in EarlyEnd(ULTIMATE_GAIN, 0.02).judge(
-        Progress(), _known_to(0.0199)
-    )
+    known = EarlyEnd(ULTIMATE_GAIN, 0.02).judge(Progress(), _known_to(0.0199))
+    assert "K_u is within 0.0199 of it" in str(known)
     found = FitProgress(ms=1.4, ms_low=1.386, ms_high=1.414)
-    assert "predicted Ms is within 0.01 of it" in EarlyEnd(MS, 0.02).judge(Progress(), found)
-    assert EarlyEnd(MS, 0.02).judge(Progress(), replace(found, ms_high=math.inf)) == ""
-    assert EarlyEnd(ULTIMATE_GAIN, 0.02).judge(Progress(), found) == ""
+    known = EarlyEnd(MS, 0.02).judge(Progress(), found)
+    assert "predicted Ms is within 0.01 of it" in str(known)
+    assert EarlyEnd(MS, 0.02).judge(Progress(), replace(found, ms_high=math.inf)) is None
+    assert EarlyEnd(ULTIMATE_GAIN, 0.02).judge(Progress(), found) is None
 
 
 def _ended(

@@ -62,7 +62,7 @@ def disturbed(begin, length, *, kind, min_cycles=3, period=0.01, samples=20_000)
     )
     command, acting, now = 0.0, 0.0, 0.0
     for k in range(samples):
-        acts = tune.facts.kicked_at + begin <= k * period < tune.kicked_at + begin + length
+        acts = tune.facts.kicked_at + begin <= k * period < tune.facts.kicked_at + begin + length
         if not (acts and kind == "stuck"):
             acting = command
         load = 0.5 if acts and kind == "load" else 0.0
