@@ -109,6 +109,8 @@ def difference(found: Identification, record: Record) -> Difference | None:
     if not np.any(moved):
         return None
     whole = model.dead_time + sum(abs(t) for t in model.time_constants) or record.duration
+    # Of what is faster than the samples they tell nothing.
+    whole = max(whole, shortest)
     lag = np.sqrt(np.maximum(edges[:-1], 0.5 * shortest) * edges[1:])
     # An impulse response without jumps has increments as its bins are wide, which is as their lag,
     # and alike where the lags are (a kernel of correlated decay, Chen, Ohlsson and Ljung 2012).
