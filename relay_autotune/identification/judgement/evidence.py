@@ -259,8 +259,9 @@ class Loop:
         moved = 1.0 + differences * law * found
         phase = np.unwrap(np.angle(np.column_stack((moved, np.ones(len(models))))), axis=1)
         turns = np.abs(phase[:, -1] - phase[:, 0]) > math.pi
-        peak = np.max(np.abs(found / moved), axis=1)
-        return np.where(turns | np.isinf(own), math.inf, np.maximum(own, peak))
+        # Relative to the peak without it, since the law may be a sampled one.
+        rise = np.max(np.abs(found / moved), axis=1) / np.max(np.abs(found), axis=1)
+        return np.where(turns, math.inf, own * np.maximum(rise, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
