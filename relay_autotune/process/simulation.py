@@ -308,6 +308,12 @@ def simulate_relay(
     direct = not settings.reverse_acting
     is_high = direct
     threshold = settings.setpoint + (settings.hysteresis if kick is None else kick)
+    if threshold == level and process.dead_time == 0.0:
+        # Which way the first switch goes would be rounding.
+        raise ModelError(
+            "the relay switches twice at t = 0 s: without dead time and hysteresis it needs a "
+            "kick to leave the set-point"
+        )
     switches = [(0.0, settings.high if is_high else settings.low)]
     on_the_way = deque([(process.dead_time, switches[0][1])])
     half = _Half(0.0, is_high)

@@ -86,7 +86,6 @@ def test_a_reason_goes_through_a_message_and_back(code):
 
 
 def test_a_recording_of_before_has_a_sentence_alone():
-    assert reason_from_message(None, "it ended") == other("it ended")
     assert reason_from_message(message(), "it ended") == other("it ended")
     assert reason_from_message(message()) == NONE
 

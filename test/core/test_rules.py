@@ -414,7 +414,8 @@ def test_rules_design_for_the_delay_that_the_loop_adds():
     later = _T.fopdt(2.0, 10.0, 1.5)
     for rule in ("imc", "simc", "amigo", "tyreus_luyben", "itae"):
         assert RULES[rule](slow)[0] == RULES[rule](task(later))[0]
-    assert design(slow, "imc").ms == pytest.approx(design(task(later), "imc").ms)
+    # Half a period is what the sampled loop is like, to the first order in it.
+    assert design(slow, "imc").ms == pytest.approx(design(task(later), "imc").ms, rel=0.01)
 
 
 def test_an_unknown_rule_is_named():

@@ -242,7 +242,8 @@ def _before_jump(whole: Problem, fit: Fit) -> int:
     mean = square / np.arange(1, n + 1)
     first = int((1.0 - _MOST_LATE) * n)
     kept = first + int(np.argmin(mean[first:])) + 1
-    if len(problem.bounds) > 1 or kept == n or mean[kept - 1] > _DIVIDED * mean[-1]:
+    left = max(float(mean[kept - 1]), NEGLIGIBLE**2)
+    if len(problem.bounds) > 1 or kept == n or left > _DIVIDED * mean[-1]:
         return whole.time.size
     return int(np.searchsorted(whole.index, problem.index[kept]))
 
