@@ -24,7 +24,7 @@ from relay_autotune.nodes.plant import MODES
 from relay_autotune.process.structures import STRUCTURES
 from relay_autotune.recordings import read_experiments
 from relay_autotune.tuning import RULES
-from tools.fill_docs import TABLES, filled
+from tools.fill_docs import REASON_FILE, TABLES, filled, reason_file
 
 EXECUTABLES = set(re.findall(r'"(\w+) = relay_autotune', (ROOT / "setup.py").read_text()))
 PLAIN = {"use_sim_time"}  # what every node has
@@ -66,6 +66,10 @@ WORDS = frozenset(re.findall(r"\w+", CODE))
 @pytest.mark.parametrize("page", GUIDE, ids=lambda p: str(p.relative_to(ROOT)))
 def test_what_the_code_says_is_written_in_the_page(page: Path) -> None:
     assert page.read_text() == filled(page.read_text()), "run `python3 tools/fill_docs.py`"
+
+
+def test_the_constants_of_the_message_are_the_table():
+    assert REASON_FILE.read_text() == reason_file(), "run `python3 tools/fill_docs.py`"
 
 
 def test_every_node_has_its_table() -> None:
