@@ -137,7 +137,7 @@ _GRID_SAMPLES = 240
 _BEST = 3
 _COARSE = 1e-4
 # Rounds of steps on few samples: largest number of steps, and how many starts take them.
-_ROUNDS = ((5, 99), (8, 3))
+_ROUNDS = ((5, 99), (16, 3))
 # Ratio of the predicted mean square to the least one, from which a fit is given up. Below the
 # second, in squares of the range, the residual is curvature, which the prediction neglects.
 _HOPELESS, _CLEAN = 6.0, 1e-6
