@@ -12,6 +12,9 @@ ROOT = Path(__file__).resolve().parents[2] / "relay_autotune_msgs"
 
 # each file's sections, as separated by ---; of each the fields in any order, by type
 PROMISED = {
+    "msg/Reason.msg": """
+        uint16 code
+        string[] names values""",
     "msg/RelaySettings.msg": """
         float64 setpoint baseline amplitude bias hysteresis extra_delay sample_period
         bool reverse_acting""",

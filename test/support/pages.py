@@ -85,7 +85,9 @@ def every_command(*pages: Path) -> list[list[str]]:
     found = [w for b in blocks("sh", pages=pages) for w in commands(b.text)]
     found += [w for b in blocks("console", pages=pages) for w, _ in sessions(b.text)]
     for page in pages:
-        found += [shlex.split(s) for s in spans(page) if re.match(r"[.\w]+ [^ ]", s)]
+        # What has a single apostrophe is a sentence of a program, not a command.
+        lines = [s for s in spans(page) if re.match(r"[.\w]+ [^ ]", s) and s.count("'") % 2 == 0]
+        found += map(shlex.split, lines)
     return parts_of(found)
 
 
