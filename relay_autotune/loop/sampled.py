@@ -23,7 +23,6 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.virtual_process import Plant
 
 Motion = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -267,6 +266,9 @@ def simulate_closed_loop(
         law = SampledPid(controller, period, Limits(low, high))
     else:
         law = controller
+    # It needs scipy, without which a controller runs.
+    from relay_autotune.process.virtual_process import Plant
+
     plant = Plant(model)
     time = np.arange(int(duration / period) + 1, dtype=np.float64) * period
     seen = np.zeros(time.size) if noise is None else noise

@@ -32,8 +32,7 @@ def session() -> Session:
     plant, command, count = FopdtPlant(2.0, 1.0, 0.5), 0.0, 0
     while session.experiment.switches < 2:
         stamp = 10**18 + 10_000_000 * count
-        stamps = {"source_timestamp": stamp, "received_timestamp": stamp}
-        command = session.answer(plant.advance(0.01 * count, command), stamps) or 0.0
+        command = session.answer(plant.advance(0.01 * count, command), stamp, stamp) or 0.0
         session.answered()
         count += 1
     assert not session.experiment.cycles

@@ -109,7 +109,8 @@ def test_the_circle_of_ms_touches_the_loop_that_is_drawn() -> None:
     assert case.added_delay > 0.0
     loop = case.best_gains.loop(in_loop(case, case.model.found.model))
     nearest = np.abs(1.0 + loop(1j * np.geomspace(1e-3, 1.0, 20_000))).min()
-    assert 1.0 / nearest == pytest.approx(case.best_gains.ms, rel=1e-6)
+    # The hold of the sampled loop, for which Ms is exact, is drawn as half a period of dead time.
+    assert 1.0 / nearest == pytest.approx(case.best_gains.ms, rel=3e-3)
 
 
 def test_rules_that_give_the_same_gains_are_drawn_once() -> None:

@@ -236,7 +236,7 @@ def test_from_the_start_to_verified_gains_by_clicks(rig: Rig, tmp_path: Path) ->
         # a refusal is told with its reason
         rig.call(
             SetParameters, f"{gains}/set_parameters",
-            SetParameters.Request(parameters=[Parameter("kc_max", value=0.4).to_parameter_msg()]),
+            SetParameters.Request(parameters=[Parameter("kc_max", value=0.35).to_parameter_msg()]),
         )  # fmt: skip
         agree("#apply-only", "They are not verified")
         tab.wait("document.querySelector('#live-status').innerText.includes('out of bounds')")

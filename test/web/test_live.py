@@ -258,7 +258,7 @@ def test_abort_is_in_reach_while_a_tune_runs_and_its_model_can_be_shaped_then(tm
         assert tab.eval("document.documentElement.scrollWidth") <= 390
         assert tab.eval("document.querySelector('#start').disabled")
         live.sample("measurement", 41.0)
-        tab.wait("document.querySelectorAll('#plot-live-measurement .line').length === 3")
+        tab.wait("document.querySelectorAll('#plot-live-measurement path.line').length === 3")
         tab.click("#abort")
         tab.until(live.abort.is_set, "the wish")
         live.tell(phase="idle", accepted=False)
