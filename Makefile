@@ -79,6 +79,7 @@ lint: setup-tests
 	@$(ENTER) && ruff check $(SOURCES)
 	@$(ENTER) && ruff check --preview --select CPY001 $(SOURCES)
 	@$(ENTER) && ruff format --check $(SOURCES)
+	@$(ENTER) && oxlint --quiet relay_autotune/web/static
 	@$(ENTER) && nice mypy
 
 docs:

@@ -432,9 +432,9 @@ export class Live {
   settings() {
     const found = {};
     for (const { name } of this.told.form) {
-      const texts = [...document.querySelectorAll(`#form input[name=${name}]`)].map((input) => input.value.trim());
-      if (texts.some((text) => text === "" || !Number.isFinite(Number(text)))) return null;
-      const numbers = texts.map(Number);
+      const typed = [...document.querySelectorAll(`#form input[name=${name}]`)].map((input) => input.value.trim());
+      if (typed.some((text) => text === "" || !Number.isFinite(Number(text)))) return null;
+      const numbers = typed.map(Number);
       found[name] = numbers.length > 1 ? numbers : numbers[0];
     }
     return found;
