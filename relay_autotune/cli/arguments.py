@@ -19,7 +19,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from relay_autotune.cli.terminal import broken, width
+from relay_autotune.cli.terminal import broken, end_with_terminal, width
 from relay_autotune.errors import MissingPackageError, RelayAutotuneError, SelectionError, defect
 from relay_autotune.quantities import Quantity
 from relay_autotune.text import visible
@@ -157,6 +157,7 @@ def guarded_in_graph(program: str, work: Callable[[ExitStack], int]) -> int:
     :param work: does it, and returns its exit status; the clients that it enters into the stack
         end afterwards.
     """
+    end_with_terminal()
     with Graph() as graph:
         status = run_command(program, lambda: work(graph))
         if graph.joined:

@@ -350,6 +350,25 @@ def agrees(question: str, *, yes: bool) -> bool:
     return _input(f"\n{question} [y/N] ").lower() in ("y", "yes")
 
 
+def end_with_terminal() -> None:
+    """Send this process SIGHUP once its terminal is closed, which the system does not always do.
+
+    So for a command in the background of a shell that was killed.
+    """
+    terminal = next(filter(os.isatty, (2, 1, 0)), None)
+    if terminal is None:
+        return
+    own = os.dup(terminal)
+
+    def watch() -> None:
+        closed = select.poll()
+        closed.register(own, 0)
+        closed.poll()
+        os.kill(os.getpid(), signal.SIGHUP)
+
+    threading.Thread(target=watch, name="terminal", daemon=True).start()
+
+
 @contextmanager
 def noted(tell: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
     """Only note signals in the block, and obey them after it.
@@ -363,6 +382,8 @@ def noted(tell: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
     before = {
         number: signal.signal(number, lambda n, _: came.append(n))
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        # An ignored SIGHUP stays ignored, for nohup.
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN
     }
     try:
         yield lambda: bool(came)

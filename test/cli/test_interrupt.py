@@ -133,3 +133,35 @@ def test_one_that_is_not_to_be_interrupted():
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+CLOSED = """
+import signal, sys, time
+from relay_autotune.cli.terminal import end_with_terminal
+signal.signal(signal.SIGHUP, signal.{0})
+end_with_terminal()
+print("begins", flush=True)
+time.sleep({1})
+"""
+
+
+@pytest.mark.parametrize(("handler", "seconds", "status"), [
+    ("SIG_DFL", 60.0, -signal.SIGHUP),
+    # As nohup leaves it.
+    ("SIG_IGN", 1.0, 0),
+])  # fmt: skip
+def test_a_closed_terminal_ends_a_command_which_the_system_sends_no_signal(
+    handler: str, seconds: float, status: int
+) -> None:
+    master, slave = pty.openpty()
+    # In a session without a terminal nobody sends it SIGHUP.
+    process = subprocess.Popen(
+        [sys.executable, "-c", CLOSED.format(handler, seconds)],
+        cwd=ROOT, text=True, stdin=slave, stdout=subprocess.PIPE, stderr=slave,
+        start_new_session=True,
+    )  # fmt: skip
+    os.close(slave)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "begins\n"
+    os.close(master)
+    assert process.wait(30.0) == status
