@@ -28,8 +28,8 @@ from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.export import number
 
 PROGRAM = "tune_loop"
-# How long the nodes may take to start on a busy machine [s].
-START_WITHIN = 30.0
+# How long nodes may take to start on a busy machine [s]; one that has ended is not waited for.
+START_WITHIN = 240.0
 # How long a node may take to end: relay_node sends its last command first [s].
 _END_WITHIN = 8.0
 # prctl's request that a process gets a signal when its parent ends.
@@ -179,9 +179,11 @@ class OwnNodes:
         """
         for name, process in self._running.items():
             if only in ("", name) and (status := process.poll()) is not None:
-                by = f" ({signal.strsignal(-status)})" if status < 0 else ""
-                lines = self.log(name).strip().splitlines() or ["without a word"]
-                return f"{name} has ended{by}: {_PREFIX.sub('', lines[-1])}"
+                lines = [_PREFIX.sub("", line) for line in self.log(name).strip().splitlines()]
+                if status >= 0:
+                    return f"{name} has ended: {lines[-1] if lines else f'status {status}'}"
+                by = f"{name} was ended by signal {-status} ({signal.strsignal(-status)})"
+                return f"{by}; its last line: {lines[-1]}" if lines else by
         return ""
 
     def __exit__(self, *_: object) -> None:

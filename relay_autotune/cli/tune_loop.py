@@ -44,6 +44,9 @@ if TYPE_CHECKING:
     from relay_autotune.nodes.loop_client import LoopClient
     from relay_autotune.nodes.tune_client import TuneClient
 
+# How long nodes that were found may take to know what they need for a tune [s].
+_READY_WITHIN = 30.0
+
 _Client = TypeVar("_Client", bound="LoopClient")
 
 
@@ -201,8 +204,8 @@ class Session:
             signals.raise_if_came()
         loops = self._looked_at(kind)
         patience = self._started(loops)
-        deadline = time.monotonic() + patience
         self._find(loops, patience)
+        deadline = time.monotonic() + min(patience, _READY_WITHIN)
         loop = loops[0]
         print("".join(f"{line}\n" for line in check_lines(loop.plan(), width())), end="",
               file=sys.stderr, flush=True)  # fmt: skip

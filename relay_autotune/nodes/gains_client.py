@@ -74,12 +74,14 @@ class GainsClient(LoopClient):
         :param leave: returns True to stop waiting.
         :raises LoopError: if it is not there.
         """
+        deadline = time.monotonic() + patience
         if not self.wait(lambda: leave() or self._verify.server_is_ready(), patience):
             there = ", ".join(n for n in self.owners("/verify") if n != self.name) or "none"
             raise LoopError(
                 f"no controller_node {self.name} within {patience:g} s; nodes that verify gains: "
                 f"{there}. Start it{self._start()}, or name another with --namespace and --node"
             )
+        self.require_answer(deadline - time.monotonic(), leave)
         if leave():
             raise LoopError(f"ended while {self.name} was looked for")
 

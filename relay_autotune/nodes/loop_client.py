@@ -164,6 +164,26 @@ class LoopClient:
                 return made_visible(answer.result())
         raise LoopError(f"{service} has not answered within {patience:g} s")
 
+    def require_answer(self, patience: float, leave: Callable[[], bool]) -> None:
+        """Wait until the node answers, which one that has just started may do late.
+
+        :param patience: how long [s]; `ANSWER_WITHIN` at least.
+        :param leave: returns True to stop waiting.
+        :raises LoopError: if it does not answer.
+        """
+        service, answers, asked = f"{self.name}/get_parameters", [], -math.inf
+        is_there = self._service(GetParameters, service).service_is_ready
+
+        def has_answered() -> bool:
+            nonlocal asked
+            if time.monotonic() - asked > ANSWER_WITHIN and is_there():
+                asked = time.monotonic()
+                answers.append(self.begin(GetParameters, service, GetParameters.Request()))
+            return leave() or any(answer.done() for answer in answers)
+
+        if not self.wait(has_answered, max(patience, ANSWER_WITHIN)):
+            raise LoopError(f"{self.name} is there, but does not answer")
+
     def begin(self, kind: Any, service: str, request: Any) -> Any:
         """Ask a service, and return the future of its answer.
 

@@ -100,6 +100,7 @@ class TuneClient(LoopClient):
                 f"no relay_node {self.name} within {patience:g} s; nodes that offer a tune: "
                 f"{others}. Start it, or name another with --namespace and --node"
             )
+        self.require_answer(deadline - time.monotonic(), leave)
         gains = self._resolved("pi_gains")
         if needs_identifier and not self.wait(
             lambda: leave() or self._node.count_publishers(gains) > 0, deadline - time.monotonic()

@@ -8,6 +8,8 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import signal
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
@@ -31,6 +33,7 @@ from relay_autotune.cli.terminal import agrees, asked_for_file, broken, number_o
 from relay_autotune.errors import LoopError, ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS, Target, exported
 from relay_autotune.exchange.messages import fill_gains, fill_reason
+from relay_autotune.nodes import loop_client
 from relay_autotune.nodes.gains_file import with_gains_file
 from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.nodes.loop_client import LoopClient
@@ -55,6 +58,53 @@ def test_the_last_line_of_a_node_that_died_ends_every_wait_for_it() -> None:
         with pytest.raises(LoopError, match="missing_node has ended: ImportError: cannot import"):
             client.wait(lambda: False, 60.0)
         assert client.wait(lambda: True, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("print('[INFO] [1.5] [loop.relay_node]: at rest'); ", "; its last line: at rest"),
+        ("", ""),
+    ],
+)
+def test_a_node_that_was_killed_is_told_with_its_signal(words: str, told: str) -> None:
+    with OwnNodes() as nodes, tempfile.TemporaryFile() as log:
+        run = f"{words}import os; os.sys.stdout.flush(); os.kill(os.getpid(), 9)"
+        nodes._logs["relay_node"] = log
+        nodes._running["relay_node"] = killed = subprocess.Popen(
+            [sys.executable, "-c", run], stdout=log
+        )
+        assert killed.wait(30.0) == -signal.SIGKILL
+        assert nodes.why_lost() == f"relay_node was ended by signal 9 (Killed){told}"
+
+
+def test_a_node_that_starts_late_is_asked_again_until_it_answers_or_has_ended() -> None:
+    """Its services may be there long before it answers, and a first request can be lost."""
+    client: Any = LoopClient.__new__(LoopClient)
+    client.name, client.why_lost = "/loop/relay_node", lambda: ""
+    asked: list[Any] = []
+
+    def ask(*_: object) -> Any:
+        answers = bool(asked)
+        asked.append(SimpleNamespace(done=lambda: answers))
+        return asked[-1]
+
+    client._services = {
+        "/loop/relay_node/get_parameters": SimpleNamespace(
+            service_is_ready=lambda: True, call_async=ask
+        )
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        now = iter(range(1000))
+        patch.setattr(loop_client.time, "monotonic", lambda: float(next(now)))
+        client._executor = SimpleNamespace(spin_once=lambda timeout_sec: None)
+        client.require_answer(200.0, lambda: False)
+        assert len(asked) == 2
+        client.require_answer(200.0, lambda: True)
+        client.why_lost = lambda: "relay_node has ended"
+        asked[:] = []
+        with pytest.raises(LoopError, match="relay_node has ended"):
+            client.require_answer(200.0, lambda: False)
 
 
 def test_no_two_joints_share_the_namespace_of_their_nodes() -> None:

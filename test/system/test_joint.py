@@ -247,7 +247,7 @@ def test_whatever_ends_an_opened_tune_the_former_controller_is_active_again(
     assert tune.wait(60.0) != 0
     robot.rig.until(lambda: robot.history()[-1] == "wheel_controller", "the controller")
     said = {
-        "relay killed": "relay_node has ended (Killed)",
+        "relay killed": "relay_node was ended by signal 9 (Killed)",
         "forwarding dies": "forward_left is inactive",
         "refused": "refuses to switch controllers: the hardware does not allow that",
     }.get(what, "cancelling")
