@@ -43,7 +43,9 @@ from sampled_relay import exact_limit_cycle
 
 from relay_autotune.analysis import RunningFit, Task, analyse
 from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN, EarlyEnd, FitProgress
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.loop.analysis import analyse_loop
 from relay_autotune.process.structures import (
     INTEGRATOR_INVERSE,
     LAG_COMPLEX,
@@ -53,7 +55,7 @@ from relay_autotune.process.structures import (
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import Record, RelaySettings
-from relay_autotune.tuning import DesignOptions, analyse_loop
+from relay_autotune.tuning.task import DesignOptions
 
 RECORDS = 50
 RATIO = 0.1

@@ -26,10 +26,11 @@ import numpy as np
 
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.methods import identify
+from relay_autotune.loop.analysis import is_stable
 from relay_autotune.loop.stability import frequencies, sensitivity_peaks
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
-from relay_autotune.tuning import ensemble, is_stable
+from relay_autotune.tuning.ensemble import ensemble
 from relay_autotune.tuning.frontier import Bounds
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.search import Search

@@ -24,11 +24,12 @@ from markdown import table, three
 import numpy as np
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.loop.analysis import Loop
+from relay_autotune.loop.analysis import Loop, is_stable
+from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.stability import frequencies, margins, sensitivity_peaks
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.tuning import RULES, Controller, is_stable
+from relay_autotune.tuning import RULES
 from relay_autotune.tuning.frontier import Bounds
 from relay_autotune.tuning.rules.limit_cycle import describing_point_of
 from relay_autotune.tuning.search import Search

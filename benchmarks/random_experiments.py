@@ -15,12 +15,10 @@ from relay_autotune import threads  # noqa: F401  before numpy
 import numpy as np
 
 from relay_autotune.errors import ModelError
-from relay_autotune.experiment.experiment import (
-    ExperimentParameters,
-    RelayExperiment,
-    SafePolicy,
-    State,
-)
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.faults import SafePolicy
+from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.experiment.samples import State
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction

@@ -34,11 +34,13 @@ from simulated_summary import summary
 import relay_autotune
 from relay_autotune.analysis import analyse
 from relay_autotune.identification.known import Known
-from relay_autotune.loop.analysis import frequencies, is_stable, sensitivity_peaks
+from relay_autotune.loop.analysis import is_stable
+from relay_autotune.loop.gains import Gains
+from relay_autotune.loop.stability import frequencies, sensitivity_peaks
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Outcome
 from relay_autotune.result import Analysis
-from relay_autotune.tuning import DesignOptions, Gains
+from relay_autotune.tuning.task import DesignOptions
 
 EXPERIMENTS = 10_000
 QUICK = 4

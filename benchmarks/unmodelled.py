@@ -32,14 +32,16 @@ from scipy.optimize import least_squares
 
 from relay_autotune.analysis import analyse
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.loop.gains import ControlLaw
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Actuator, VirtualProcess
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Record
-from relay_autotune.tuning import DesignOptions, DesignTask, design
+from relay_autotune.tuning import design
+from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import Verdict
 
 FloatArray = NDArray[np.float64]

@@ -27,7 +27,8 @@ from markdown import table
 from numpy.typing import NDArray
 
 from relay_autotune.analysis import analyse
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.loop.gains import Gains
 from relay_autotune.process.transfer_function import TransferFunction

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from relay_autotune.identification.known import Known
     from relay_autotune.identification.methods import METHODS, identify
     from relay_autotune.identification.result import Identification
+    from relay_autotune.loop.gains import Controller, Gains
     from relay_autotune.loop.sampled import simulate_closed_loop
     from relay_autotune.process.structures import STRUCTURES
     from relay_autotune.process.transfer_function import TransferFunction
@@ -46,7 +47,8 @@ if TYPE_CHECKING:
     from relay_autotune.recordings import read_records
     from relay_autotune.report import draw, write_report
     from relay_autotune.result import Analysis
-    from relay_autotune.tuning import RULES, Controller, DesignOptions, Gains, tune
+    from relay_autotune.tuning import RULES, tune
+    from relay_autotune.tuning.task import DesignOptions
 
 _HOMES = {
     "analysis": ("analyse", "analyse_jointly"),

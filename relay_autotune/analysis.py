@@ -37,17 +37,10 @@ from relay_autotune.record.cycles import cycles_of, limit_cycle
 from relay_autotune.record.record import Cycle, Outcome, Record, one_record
 from relay_autotune.record.thinning import thinned
 from relay_autotune.result import Analysis, Shaping
-from relay_autotune.tuning import (
-    DEFAULT_RULE,
-    RULES,
-    DesignOptions,
-    DesignTask,
-    design,
-    ensemble,
-    rule_named,
-)
-from relay_autotune.tuning.ensemble import predicted_ms
+from relay_autotune.tuning import DEFAULT_RULE, RULES, design, rule_named
+from relay_autotune.tuning.ensemble import ensemble, predicted_ms
 from relay_autotune.tuning.rules.limit_cycle import describing_point_of_cycle
+from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict, judge
 
 _NO_GAINS = {

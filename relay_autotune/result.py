@@ -21,8 +21,8 @@ from relay_autotune.process.transfer_function import process_mathml, process_tex
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Cycle, Record
 from relay_autotune.text import digits, plus_minus
-from relay_autotune.tuning import DesignOptions, DesignTask
 from relay_autotune.tuning.ensemble import PredictedMs, ensemble_peaks
+from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import NOT_JUDGED, Finding, Judgement, Verdict, judge
 
 

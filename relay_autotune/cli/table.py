@@ -21,9 +21,9 @@ from relay_autotune.verdict import Judgement, Result, Verdict
 
 if TYPE_CHECKING:
     from relay_autotune.identification.result import Identification, Validation
+    from relay_autotune.loop.gains import Gains, Performance
     from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.result import Analysis
-    from relay_autotune.tuning import Gains, Performance
 
 # Rivals beyond these are told in the JSON document alone.
 _RIVALS = 3

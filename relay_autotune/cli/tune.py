@@ -37,6 +37,8 @@ from relay_autotune.exchange.document import to_json
 from relay_autotune.exchange.export import exported
 from relay_autotune.exchange.fields import to_document
 from relay_autotune.exchange.models import model_fields
+from relay_autotune.loop.analysis import analyse_loop
+from relay_autotune.loop.gains import Gains, Performance
 from relay_autotune.process.structures import (
     GENERAL,
     STRUCTURES,
@@ -48,18 +50,10 @@ from relay_autotune.process.transfer_function import TransferFunction, process_t
 from relay_autotune.record.record import Outcome
 from relay_autotune.result import Shaping
 from relay_autotune.text import digits
-from relay_autotune.tuning import (
-    DEFAULT_RULE,
-    RULES,
-    DesignTask,
-    Gains,
-    Performance,
-    analyse_loop,
-    design,
-    task_of_model,
-)
+from relay_autotune.tuning import DEFAULT_RULE, RULES, design, task_of_model
 from relay_autotune.tuning.compensators import COMPENSATORS, Compensator
 from relay_autotune.tuning.forms import FORMS, series_form
+from relay_autotune.tuning.task import DesignTask
 
 if TYPE_CHECKING:
     from relay_autotune.report.case import Case

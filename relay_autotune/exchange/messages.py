@@ -35,8 +35,8 @@ from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict
 
 if TYPE_CHECKING:
     from relay_autotune.identification.result import Identification
+    from relay_autotune.loop.gains import Gains
     from relay_autotune.process.transfer_function import TransferFunction
-    from relay_autotune.tuning import Gains
 
 NANOSECONDS = 1_000_000_000
 

@@ -49,8 +49,6 @@ from relay_autotune.experiment.switching import Switching
 from relay_autotune.reasons import NONE, Code, Reason, other
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 
-__all__ = ["ExperimentParameters", "RelayExperiment", "SafePolicy", "State"]
-
 _BASELINE = SafePolicy()
 
 _TRANSITIONS: Mapping[tuple[State, Event], tuple[State, Callable[[Setup, Facts], Phase]]] = {

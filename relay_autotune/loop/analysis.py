@@ -385,9 +385,6 @@ def _iae(whole: float, error: FloatArray, step: float) -> float:
     return abs(whole) + 2.0 * float(other.sum()) * step
 
 
-__all__ = ["Loop", "analyse_loop", "frequencies", "is_stable", "ms_on", "sensitivity_peaks"]
-
-
 def is_stable(controller: ControlLaw, model: TransferFunction) -> bool:
     """Return whether the closed loop is stable.
 

@@ -20,7 +20,7 @@ from rclpy.parameter import Parameter as RosParameter
 
 from relay_autotune.errors import NotReadyError, RelayAutotuneError
 from relay_autotune.exchange.messages import fill_reason
-from relay_autotune.experiment.experiment import SafePolicy
+from relay_autotune.experiment.faults import SafePolicy
 from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.phases import SETTLING_LIMIT, SMALL_CYCLES, how_long

@@ -236,19 +236,6 @@ def _usual_stay(stay: FloatArray) -> float:
     return float(ordered[int(np.searchsorted(total, 0.5 * total[-1]))])
 
 
-__all__ = [
-    "MIN_CYCLES",
-    "TOLERANCE",
-    "LimitCycle",
-    "agree",
-    "cycle_from_samples",
-    "cycles_of",
-    "find_cycles",
-    "limit_cycle",
-    "next_cycle",
-    "settings_of",
-]
-
 MIN_CYCLES = 3
 TOLERANCE = 0.02
 

@@ -22,16 +22,6 @@ PICTURES = (".png", ".svg", ".pdf")
 # In the head of each page, before the version.
 _GENERATOR = b'<meta name="generator" content="relay_autotune '
 
-__all__ = [
-    "PICTURES",
-    "draw",
-    "is_ours",
-    "write_figures",
-    "write_page",
-    "write_picture",
-    "write_report",
-]
-
 
 def draw(
     analysis: Analysis, path: Path | str, *, title: str, truth: TransferFunction | None = None

@@ -25,6 +25,7 @@ from relay_autotune.exchange.models import model_of_fields
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.limit_cycle.fourier import FrequencyPoint
 from relay_autotune.identification.result import Identification
+from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import NORMAL_95
@@ -32,7 +33,7 @@ from relay_autotune.record.cycles import LimitCycle, cycles_of, limit_cycle, set
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 from relay_autotune.result import Analysis
 from relay_autotune.text import visible
-from relay_autotune.tuning import Controller, Gains, ensemble
+from relay_autotune.tuning.ensemble import ensemble
 from relay_autotune.verdict import NOT_JUDGED, Judgement
 
 

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.analysis import analyse_loop
+from relay_autotune.loop.gains import Controller, Performance
 from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import Case, in_loop
 from relay_autotune.text import date_text, digits
-from relay_autotune.tuning import Controller, Performance, analyse_loop
 from relay_autotune.verdict import Finding, Result, Verdict
 
 Tone = Literal["good", "warn", "bad"]

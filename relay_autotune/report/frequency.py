@@ -15,6 +15,7 @@ import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.loop.sampled import ClosedLoop, simulate_closed_loop
 from relay_autotune.process.transfer_function import TransferFunction
@@ -35,14 +36,13 @@ from relay_autotune.report.style import (
     in_steps,
     legend,
 )
-from relay_autotune.tuning import Controller, Gains
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.path import Path
 
-    from relay_autotune.tuning import Gains
+    from relay_autotune.loop.gains import Gains
 
 
 # 95 % of a normal distribution in the plane lie within this number of standard deviations.
@@ -126,7 +126,7 @@ def loop_frequencies(loop: TransferFunction) -> FloatArray:
 
     :param loop: controller times process.
     """
-    from relay_autotune.loop.analysis import frequencies
+    from relay_autotune.loop.stability import frequencies
 
     grid = frequencies(loop)
     size = np.abs(loop(1j * grid))

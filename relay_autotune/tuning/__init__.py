@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 from relay_autotune.errors import ModelError, TuningError, look_up
 from relay_autotune.identification.result import Identification
-from relay_autotune.loop.analysis import Loop, analyse_loop, is_stable
+from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller, Gains, Performance
 from relay_autotune.loop.laws import OWN_LAW
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
-from relay_autotune.tuning.ensemble import ensemble, ensemble_ms
+from relay_autotune.tuning.ensemble import ensemble_ms
 from relay_autotune.tuning.law_cost import cost_of
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.rules import PUBLISHED, Rule
@@ -27,27 +27,6 @@ from relay_autotune.tuning.task import DesignOptions, DesignTask, cautions
 
 RULES: dict[str, Rule] = {"robust": robust, **PUBLISHED}
 DEFAULT_RULE = "robust"
-
-__all__ = [
-    "DEFAULT_RULE",
-    "RULES",
-    "Controller",
-    "DesignOptions",
-    "DesignTask",
-    "Designed",
-    "Gains",
-    "Performance",
-    "Rule",
-    "analyse_loop",
-    "design",
-    "designed",
-    "ensemble",
-    "is_stable",
-    "judged",
-    "rule_named",
-    "task_of_model",
-    "tune",
-]
 
 
 def rule_named(name: str) -> Rule:

@@ -32,9 +32,9 @@ from relay_autotune.report.frequency import (
     swept_parts,
 )
 from relay_autotune.result import Shaping
-from relay_autotune.tuning import DEFAULT_RULE, Designed, DesignOptions, designed, judged
+from relay_autotune.tuning import DEFAULT_RULE, Designed, designed, judged
 from relay_autotune.tuning.ensemble import ensemble_peaks
-from relay_autotune.tuning.task import DesignTask
+from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict
 
 # What the slider asks for: from calm to fast.

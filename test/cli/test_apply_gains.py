@@ -25,7 +25,8 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.verifier import without_arrays
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code
-from relay_autotune.tuning import DesignOptions, DesignTask, design
+from relay_autotune.tuning import design
+from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.web.live import APPLY, VERIFY, PageCommand
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, Verification

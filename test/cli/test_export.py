@@ -23,10 +23,11 @@ from hypothesis import strategies as st
 from relay_autotune.cli import replay, terminal, tune
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.exchange.export import Target, exported, number, parameters, plain
+from relay_autotune.loop.gains import Gains, Performance
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning import DesignOptions, Gains, Performance
 from relay_autotune.tuning import tune as tune_model
+from relay_autotune.tuning.task import DesignOptions
 
 PERFORMANCE = Performance(
     ms=1.4,

@@ -42,7 +42,8 @@ from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code
 from relay_autotune.text import in_units
-from relay_autotune.tuning import DesignOptions, DesignTask, design
+from relay_autotune.tuning import design
+from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import Verdict
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains, Reason

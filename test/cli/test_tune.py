@@ -26,8 +26,9 @@ from relay_autotune.process.structures import (
     UNSTABLE_SOPDT,
 )
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning import RULES, DesignOptions, DesignTask, design
+from relay_autotune.tuning import RULES, design
 from relay_autotune.tuning.compensators import COMPENSATORS
+from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 FOPDT = "--gain 1.65 --time-constants 20 --dead-time 10"
 

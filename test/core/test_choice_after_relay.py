@@ -10,7 +10,8 @@ import math
 import numpy as np
 import pytest
 
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.process.structures import LAG_COMPLEX, structure_named
 from relay_autotune.process.transfer_function import TransferFunction

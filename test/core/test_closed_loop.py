@@ -12,7 +12,8 @@ import pytest
 from scipy.linalg import expm
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.analysis import Loop
+from relay_autotune.loop.analysis import Loop, analyse_loop
+from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import (
     Limits,
     SampledPid,
@@ -20,7 +21,6 @@ from relay_autotune.loop.sampled import (
     simulate_closed_loop,
 )
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning import Controller, analyse_loop
 from relay_autotune.tuning.noise import open_noise_gain
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)

@@ -11,15 +11,16 @@ import numpy as np
 import pytest
 
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.analysis import analyse_loop
 from relay_autotune.loop.sampled import simulate_closed_loop
 from relay_autotune.process.structures import IPDT
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning import DesignOptions, DesignTask, analyse_loop
 from relay_autotune.tuning.compensators import (
     SampledCompensator,
     dead_time_compensator,
     high_order_compensator,
 )
+from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 FOPDT = TransferFunction.fopdt(0.8724, 1.9574, 10.8567)
 LAGS = TransferFunction.lag_n(1.5661, 10.6313, 5, 0.0)

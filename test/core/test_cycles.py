@@ -15,7 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_autotune.errors import RecordError
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.record.cycles import (
     agree,
     cycle_from_samples,

@@ -10,7 +10,7 @@ import pytest
 from virtual_tune import tuned
 
 from relay_autotune.analysis import analyse
-from relay_autotune.experiment.experiment import ExperimentParameters
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.methods import identify
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction

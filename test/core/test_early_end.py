@@ -15,13 +15,15 @@ from hypothesis import strategies as st
 
 from relay_autotune.analysis import RunningFit, Task, analyse, model_so_far
 from relay_autotune.experiment.early_end import MS, ULTIMATE_GAIN, EarlyEnd, FitProgress
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.samples import Facts
+from relay_autotune.loop.analysis import analyse_loop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import Outcome
-from relay_autotune.tuning import DesignOptions, analyse_loop
+from relay_autotune.tuning.task import DesignOptions
 
 PERIOD = 0.03
 

@@ -13,13 +13,15 @@ from fopdt_plant import FopdtPlant, run, wang_limit_cycle
 
 from relay_autotune.analysis import analyse
 from relay_autotune.errors import ParameterError
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment, SafePolicy
+from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.faults import (
     ClockWatch,
     FrozenWatch,
     RunawayWatch,
+    SafePolicy,
     is_growing,
 )
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.process.structures import UNSTABLE_FOPDT, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant

@@ -14,7 +14,8 @@ from histories import History
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.relay_law import OVERDUE, DwellFilter
 from relay_autotune.experiment.samples import GAP, Samples
 from relay_autotune.experiment.switching import MOST_COMPENSATED

@@ -13,7 +13,8 @@ import pytest
 from analysed import completed
 
 from relay_autotune.analysis import analyse
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.judgement.checks import (
     lost_effect,

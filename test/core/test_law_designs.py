@@ -17,8 +17,9 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS, LawRate
 from relay_autotune.process.structures import INTEGRATOR_LAG, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning import DesignOptions, DesignTask, design, tune
+from relay_autotune.tuning import design, tune
 from relay_autotune.tuning.frontier import Bounds, Responses
+from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 PROCESSES = {
     "fopdt": TransferFunction.fopdt(0.9, 2.0, 0.8),

@@ -13,7 +13,7 @@ import pytest
 from virtual_tune import tuned
 
 from relay_autotune.analysis import model_so_far
-from relay_autotune.experiment.experiment import ExperimentParameters
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.process.structures import structure_named

@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.faults import why_noise_alone
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.reasons import Code

@@ -12,7 +12,8 @@ import pytest
 from scipy.signal import lsim, tf2ss
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.process.structures import INTEGRATOR_LAG

@@ -11,8 +11,9 @@ import re
 import numpy as np
 import pytest
 
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.faults import Repetition, SilenceWatch
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.process.structures import structure_named

@@ -10,7 +10,9 @@ import re
 import numpy as np
 import pytest
 
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment, State
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.experiment.samples import State
 from relay_autotune.experiment.settling import RestWatch
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess

@@ -16,6 +16,7 @@ from sampled_relay import exact_limit_cycle
 from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.analysis import analyse_loop
 from relay_autotune.process.structures import (
     INTEGRATOR_INVERSE,
     INTEGRATOR_LAG,
@@ -27,7 +28,7 @@ from relay_autotune.process.structures import (
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.record.record import RelaySettings
-from relay_autotune.tuning import RULES, DesignOptions, DesignTask, analyse_loop, design
+from relay_autotune.tuning import RULES, design
 from relay_autotune.tuning.rules import PUBLISHED
 from relay_autotune.tuning.rules.fopdt import imc, imc_chang, itae, unstable
 from relay_autotune.tuning.rules.limit_cycle import (
@@ -47,6 +48,7 @@ from relay_autotune.tuning.rules.step_response import (
     two_point_fopdt,
 )
 from relay_autotune.tuning.rules.thyagarajan2003 import lcmax, phase_margin, thyagarajan
+from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 _T = TransferFunction
 

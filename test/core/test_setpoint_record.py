@@ -10,7 +10,8 @@ import pytest
 
 from relay_autotune.analysis import model_so_far
 from relay_autotune.control.controller import PidController
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.judgement.assessment import assess
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction

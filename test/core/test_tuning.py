@@ -14,20 +14,15 @@ from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.waveform.method import identify_waveform
+from relay_autotune.loop.analysis import analyse_loop, is_stable
+from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import simulate_closed_loop
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
-from relay_autotune.tuning import (
-    Controller,
-    DesignOptions,
-    DesignTask,
-    analyse_loop,
-    design,
-    ensemble,
-    is_stable,
-    tune,
-)
+from relay_autotune.tuning import design, tune
+from relay_autotune.tuning.ensemble import ensemble
+from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 
 def _controller(name: str, inputs: dict[str, float]) -> Controller:

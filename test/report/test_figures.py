@@ -20,7 +20,8 @@ from relay_autotune.report.case import case_of, in_loop
 from relay_autotune.report.figures import PLATES, rate_of, switches_of
 from relay_autotune.report.frequency import distinct_gains, simulated, swept_area
 from relay_autotune.report.style import in_steps, inline, save, thinned
-from relay_autotune.tuning import DesignOptions, tune
+from relay_autotune.tuning import tune
+from relay_autotune.tuning.task import DesignOptions
 
 
 def levels(names: str) -> Record:

@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.phases import KICK_LIMIT, KICK_SETTLINGS
 from relay_autotune.experiment.relay_law import OVERDUE, OVERDUE_SAMPLES
 from relay_autotune.experiment.samples import GAP

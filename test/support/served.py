@@ -21,7 +21,7 @@ from tornado.websocket import websocket_connect
 from relay_autotune.recordings import read_experiments
 from relay_autotune.report.case import case_of
 from relay_autotune.result import Analysis
-from relay_autotune.tuning import DesignOptions
+from relay_autotune.tuning.task import DesignOptions
 from relay_autotune.web.address import Address
 from relay_autotune.web.live import Live
 from relay_autotune.web.server import Page, in_background

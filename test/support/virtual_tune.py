@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from relay_autotune.experiment.experiment import ExperimentParameters, RelayExperiment
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 

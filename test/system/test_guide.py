@@ -22,7 +22,8 @@ from rcl_interfaces.srv import ListParameters
 from rclpy.action import get_action_server_names_and_types_by_node
 
 from relay_autotune.nodes.plant import model_from
-from relay_autotune.tuning import RULES, DesignOptions, DesignTask
+from relay_autotune.tuning import RULES
+from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune_msgs.msg import PidGains
 from tools.fill_docs import TABLES
 

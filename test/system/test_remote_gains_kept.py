@@ -18,7 +18,8 @@ from std_msgs.msg import Float64
 
 from relay_autotune.exchange.messages import fill_gains
 from relay_autotune.process.transfer_function import TransferFunction as Process
-from relay_autotune.tuning import DesignOptions, DesignTask, design
+from relay_autotune.tuning import design
+from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, TransferFunction
 

@@ -27,7 +27,8 @@ from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import Case, given_model
 from relay_autotune.report.frequency import shown_load
 from relay_autotune.result import Shaping
-from relay_autotune.tuning import Designed, DesignOptions, designed, judged, task_of_model
+from relay_autotune.tuning import Designed, designed, judged, task_of_model
+from relay_autotune.tuning.task import DesignOptions
 from relay_autotune.verdict import NOT_JUDGED, Verdict
 from relay_autotune.web import wire
 from relay_autotune.web.shape import DesignRequest, PageModel, asked_of

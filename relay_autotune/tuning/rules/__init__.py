@@ -39,5 +39,3 @@ PUBLISHED: dict[str, Rule] = {
     "amigo": amigo,
     "unstable": unstable,
 }
-
-__all__ = ["PUBLISHED", "Rule"]
