@@ -31,7 +31,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning import RULES
 from relay_autotune.tuning.frontier import Bounds
-from relay_autotune.tuning.rules.limit_cycle import describing_point_of
+from relay_autotune.tuning.rules.formulas import describing_point_of
 from relay_autotune.tuning.search import Search
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 

@@ -31,7 +31,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import RULES, design
 from relay_autotune.tuning.compensators import dead_time_compensator, high_order_compensator
 from relay_autotune.tuning.forms import SeriesForm
-from relay_autotune.tuning.rules.limit_cycle import describing_point_of
+from relay_autotune.tuning.rules.formulas import describing_point_of
 from relay_autotune.tuning.rules.step_response import two_point_fopdt
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 

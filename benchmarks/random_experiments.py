@@ -18,7 +18,7 @@ from relay_autotune.errors import ModelError
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.faults import SafePolicy
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.samples import State
+from relay_autotune.experiment.phases import State
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction

@@ -17,7 +17,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from relay_autotune.analysis import Task, analyse, analyse_jointly
+from relay_autotune.analysis import Task, agreed, analyse, analyse_jointly
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.signals import CLOCKS, TIME_UNITS, Selection
 from relay_autotune.cli.arguments import (
@@ -37,7 +37,6 @@ from relay_autotune.exchange.export import EXPORTS, WITHOUT_LAW, Target, exporte
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.loop.laws import LAWS
-from relay_autotune.parts import agreed
 from relay_autotune.quantities import declared
 from relay_autotune.record.record import Record
 from relay_autotune.recordings import read_experiments

@@ -33,18 +33,21 @@ from relay_autotune.experiment.faults import (
     SilenceWatch,
 )
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.phases import Kick, Phase, Probe, Settle
-from relay_autotune.experiment.relay_law import Levels
-from relay_autotune.experiment.samples import (
+from relay_autotune.experiment.phases import (
     Ended,
     Event,
     Facts,
+    Kick,
     Left,
+    Phase,
+    Probe,
     Samples,
+    Settle,
     Setup,
     State,
     failed,
 )
+from relay_autotune.experiment.relay_law import Levels
 from relay_autotune.experiment.switching import Switching
 from relay_autotune.reasons import NONE, Code, Reason, other
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings

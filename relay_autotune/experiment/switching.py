@@ -24,7 +24,7 @@ from relay_autotune.experiment.faults import (
     why_no_return,
     why_noise_alone,
 )
-from relay_autotune.experiment.phases import kick_limit
+from relay_autotune.experiment.phases import Answer, Ended, Facts, Setup, State, failed, kick_limit
 from relay_autotune.experiment.relay_law import (
     DwellFilter,
     DwellLimit,
@@ -33,7 +33,6 @@ from relay_autotune.experiment.relay_law import (
     ample_swing,
     clear_swing,
 )
-from relay_autotune.experiment.samples import Answer, Ended, Facts, Setup, State, failed
 from relay_autotune.reasons import Code, Reason, Value
 from relay_autotune.record.cycles import MIN_CYCLES, cycle_from_samples, next_cycle
 from relay_autotune.record.record import Cycle

@@ -11,9 +11,11 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
@@ -30,9 +32,9 @@ from relay_autotune.errors import (
     RelayAutotuneError,
     TuningError,
 )
+from relay_autotune.exchange.export import TOPICS
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.nodes import quality, tables
-from relay_autotune.nodes.gains_file import with_gains_file
 from relay_autotune.nodes.gains_keeper import GainsJournal, GainsKeeper
 from relay_autotune.nodes.gains_place import (
     OwnGains,
@@ -54,6 +56,41 @@ from relay_autotune.reasons import Code, Reason
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage
+
+FLAG = "--gains"
+
+
+def with_gains_file(words: Sequence[str]) -> list[str]:
+    """Return a command line with --gains FILE as ROS takes it.
+
+    :param words: the arguments of controller_node.
+    :raises ParameterError: if the file cannot be read.
+    """
+    found = list(words)
+    if FLAG not in found:
+        return found
+    at = found.index(FLAG)
+    file = "".join(found[at + 1 : at + 2])
+    given = ["--params-file", file]
+    for name, topic in _topics(file).items():
+        given += ["-r", f"{name}:={topic}"]
+    return [*found[:at], *found[at + 2 :], "--ros-args", *given]
+
+
+def _topics(file: str) -> dict[str, str]:
+    """Return the names of the topics that a file of gains gives."""
+    try:
+        read = yaml.safe_load(Path(file).read_text(encoding="utf-8"))
+        section = read.get(TOPICS, {}).get("ros__parameters", {})
+        return {str(name): str(topic) for name, topic in section.items()}
+    except (OSError, UnicodeDecodeError) as error:
+        raise ParameterError(f"{FLAG} {file}: it cannot be read ({error})") from None
+    except (yaml.YAMLError, AttributeError) as error:
+        what = str(error).partition("\n")[0]
+        raise ParameterError(
+            f"{FLAG} {file}: expected the parameters of a controller_node in YAML ({what})"
+        ) from None
+
 
 # How long the end of the process waits for the acknowledgement of its last message.
 ACKNOWLEDGE = Duration(seconds=0.2)

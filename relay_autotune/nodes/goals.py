@@ -15,7 +15,7 @@ from rclpy.node import Node
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.messages import fill_reason
 from relay_autotune.experiment.experiment import RelayExperiment
-from relay_autotune.experiment.samples import State
+from relay_autotune.experiment.phases import State
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.reasons import Reason

@@ -44,7 +44,7 @@ from relay_autotune.exchange.messages import (
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.faults import ClockWatch
-from relay_autotune.experiment.samples import State
+from relay_autotune.experiment.phases import State
 from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.quality import QUIET_AFTER_GO, for_bag

@@ -37,9 +37,14 @@ from relay_autotune.loop.stability import peaks
 from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.tuning.candidates import Candidates, Optimum, Surroundings, stable_gains
+from relay_autotune.tuning.candidates import (
+    Candidates,
+    Optimum,
+    Surroundings,
+    filters_of,
+    stable_gains,
+)
 from relay_autotune.tuning.frontier import Bounds, Responses, design_grid
-from relay_autotune.tuning.noise import filters_of
 
 _POINTS = 512
 _RESETS, _TURNS = 6.0, 5.0

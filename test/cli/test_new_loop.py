@@ -34,7 +34,7 @@ from relay_autotune.errors import LoopError, ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS, Target, exported
 from relay_autotune.exchange.messages import fill_gains, fill_reason
 from relay_autotune.nodes import loop_client
-from relay_autotune.nodes.gains_file import with_gains_file
+from relay_autotune.nodes.controller import with_gains_file
 from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS

@@ -21,7 +21,7 @@ from relay_autotune.loop.sampled import (
     simulate_closed_loop,
 )
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.noise import open_noise_gain
+from relay_autotune.tuning.candidates import open_noise_gain
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 PI, PID = Controller(0.67, 21.1), Controller(0.7, 16.0, 3.7, 0.37, 0.6)

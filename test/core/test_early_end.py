@@ -17,7 +17,7 @@ from relay_autotune.analysis import RunningFit, Task, analyse, model_so_far
 from relay_autotune.experiment.early_end import MS, ULTIMATE_GAIN, EarlyEnd, FitProgress
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.samples import Facts
+from relay_autotune.experiment.phases import Facts
 from relay_autotune.loop.analysis import analyse_loop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

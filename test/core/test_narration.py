@@ -13,8 +13,7 @@ import pytest
 
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.phases import how_long
-from relay_autotune.experiment.samples import State
+from relay_autotune.experiment.phases import State, how_long
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import VirtualProcess
 

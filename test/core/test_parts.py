@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from sampled_relay import simulate_sampled_relay
 
-from relay_autotune.analysis import analyse
-from relay_autotune.parts import agreed
+from relay_autotune.analysis import agreed, analyse
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 from relay_autotune.result import Analysis

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from relay_autotune.errors import ParameterError, RecordError
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.samples import State
+from relay_autotune.experiment.phases import State
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.cycles import cycles_of, limit_cycle

@@ -12,7 +12,7 @@ import pytest
 
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.samples import State
+from relay_autotune.experiment.phases import State
 from relay_autotune.experiment.settling import RestWatch
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess

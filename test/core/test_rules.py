@@ -30,13 +30,16 @@ from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.record.record import RelaySettings
 from relay_autotune.tuning import RULES, design
 from relay_autotune.tuning.rules import PUBLISHED
-from relay_autotune.tuning.rules.fopdt import imc, imc_chang, itae, unstable
-from relay_autotune.tuning.rules.limit_cycle import (
+from relay_autotune.tuning.rules.formulas import (
     describing_point_of,
     describing_point_of_cycle,
     half_cycle,
+    imc,
+    imc_chang,
+    itae,
     tyreus_luyben,
     tyreus_luyben_cycle,
+    unstable,
     ziegler_nichols,
     ziegler_nichols_cycle,
 )

@@ -23,8 +23,8 @@ from relay_autotune.tuning.rules.luyben2003 import (
     integral_time,
     luyben2003,
     luyben2003_p,
+    resonant_gain,
 )
-from relay_autotune.tuning.rules.resonance import resonant_gain
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 DRUM = PROCESSES["Luyben int+inv"]

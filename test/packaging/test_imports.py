@@ -24,7 +24,7 @@ FLOORS = (
     {"loop"},
     {"control", "tuning"},
     {"result"},
-    {"analysis", "parts"},
+    {"analysis"},
     {"exchange"},
     {"bag"},
     {"recordings"},
@@ -36,7 +36,7 @@ FLOORS = (
 FLOOR_OF = {name: number for number, names in enumerate(FLOORS) for name in sorted(names)}
 # What brings ROS in; all else runs without it.
 NUMERIC = ("errors", "reasons", "quantities", "record", "process", "experiment", "identification",
-           "loop", "control", "tuning", "result", "analysis", "parts", "exchange")  # fmt: skip
+           "loop", "control", "tuning", "result", "analysis", "exchange")  # fmt: skip
 FOREIGN = {"numpy", "scipy"}
 
 

@@ -8,10 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from relay_autotune.loop.gains import Controller
-from relay_autotune.tuning.rules.fopdt import imc, imc_chang, itae, unstable
-from relay_autotune.tuning.rules.limit_cycle import (
+from relay_autotune.tuning.rules.formulas import (
+    imc,
+    imc_chang,
+    itae,
     tyreus_luyben,
     tyreus_luyben_cycle,
+    unstable,
     ziegler_nichols,
     ziegler_nichols_cycle,
 )

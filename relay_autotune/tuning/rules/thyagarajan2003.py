@@ -31,9 +31,8 @@ from relay_autotune.tuning.rules.applicability import (
     process_of,
     wants_pid,
 )
-from relay_autotune.tuning.rules.fopdt import ITAE_RANGE, imc, itae
-from relay_autotune.tuning.rules.limit_cycle import half_cycle, tyreus_luyben
-from relay_autotune.tuning.rules.resonance import resonant_gain
+from relay_autotune.tuning.rules.formulas import ITAE_RANGE, half_cycle, imc, itae, tyreus_luyben
+from relay_autotune.tuning.rules.luyben2003 import resonant_gain
 from relay_autotune.tuning.task import DesignTask
 
 RESONANCE = 3.0

@@ -14,27 +14,181 @@ for, on the exact loop. Where none does, it is the fastest within 1.15 times the
 the rule attains. Of the published rules for this process it is the sound one: on the exact loop
 its smallest Ms is 4 to 10 % above that of any PI or PID for D/tau up to 0.5, whereas De Paor and
 O'Malley's PI (1989) and Visioli's PID (2001) have an Ms of 6 and more at any D/tau.
+
+Rules for the ultimate point, by the model's phase or by the limit cycle of a relay.
+
+The model's own point is where its phase is -180 degrees. The other is what the describing function
+reads from the limit cycle of a relay of amplitude h, ``K_u = 4 h/(pi a)`` and ``P_u = P``; on a
+FOPDT process its K_u is off by -19 % (D/tau = 0.05) to +22 % (D/tau = 10). The papers' examples
+take the latter, and so do the rules whose name ends in ``_cycle``.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
-from relay_autotune.errors import TuningError
+from relay_autotune.errors import ModelError, TuningError
+from relay_autotune.identification.limit_cycle.shape import shape_of_half_cycle
 from relay_autotune.loop.gains import Controller
+from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.tuning.rules.applicability import (
     Fopdt,
     controller,
+    describing_point,
     fopdt_of,
     named,
+    own_point,
     process_of,
     wants_pid,
 )
 from relay_autotune.tuning.task import DesignTask
+
+_REACH = np.geomspace(1.0, 4.0, 60)
+_AT_SWITCH = np.zeros(1)
+
+
+def half_cycle(model: TransferFunction) -> HalfCycle | None:
+    """Return half a period of the limit cycle under an ideal relay of amplitude 1.
+
+    The half period is the one nearest to ``pi/w_u`` at which the output passes zero upward at the
+    switch.
+
+    :param model: the process.
+    :return: None if it has no ultimate point or no such oscillation.
+    """
+    point = ultimate_point(model)
+    if point is None:
+        return None
+    middle = math.pi / point.frequency
+    for low, high in itertools.pairwise(_REACH):
+        for a, b in ((middle * low, middle * high), (middle / high, middle / low)):
+            found = _between(model, a, b)
+            if found is not None:
+                return found
+    return None
+
+
+def _between(model: TransferFunction, low: float, high: float) -> HalfCycle | None:
+    low = max(low, model.dead_time * (1.0 + 1e-9))
+    if not low < high:
+        return None
+
+    def level(half_period: float) -> float:
+        return float(HalfCycle(model, half_period)(_AT_SWITCH)[0])
+
+    try:
+        if level(low) * level(high) > 0.0:
+            return None
+        cycle = HalfCycle(model, float(brentq(level, low, high, rtol=1e-14, xtol=1e-300)))
+    except (ModelError, np.linalg.LinAlgError):
+        return None
+    return cycle if cycle.slope(_AT_SWITCH)[0] > 0.0 else None
+
+
+def describing_point_of(model: TransferFunction) -> UltimatePoint | None:
+    """Return K_u and w_u that an ideal relay test of a model would give.
+
+    ``K_u = 4 h/(pi a)``, ``w_u = 2 pi/P`` (Chang, Shen and Yu 1992, eqs 1 and 2), with the exact
+    amplitude and period of the limit cycle.
+
+    :param model: the process.
+    :return: None if it has no limit cycle.
+    """
+    cycle = half_cycle(model)
+    if cycle is None:
+        return None
+    a = shape_of_half_cycle(cycle).amplitude
+    return UltimatePoint(model.process_sign * 4.0 / (math.pi * a), math.pi / cycle.half_period)
+
+
+def describing_point_of_cycle(
+    period: float, period_high: float, amplitude: float, relay: float, sign: float
+) -> UltimatePoint:
+    """Return K_u and w_u that the describing function reads from a limit cycle that was recorded.
+
+    ``K_u = 4 h/(pi a) sin(pi T_high/P)``: the first harmonic of the relay's wave over the
+    amplitude; the sine is 1 for an unbiased relay.
+
+    :param period: P [s].
+    :param period_high: time with the command high [s].
+    :param amplitude: half of peak to peak of the measurement, a [y].
+    :param relay: h [u].
+    :param sign: of the process.
+    """
+    gain = 4.0 * relay / (math.pi * amplitude) * math.sin(math.pi * period_high / period)
+    return UltimatePoint(math.copysign(gain, sign), 2.0 * math.pi / period)
+
+
+@dataclass(frozen=True)
+class _UltimateRule:
+    """A rule for the ultimate point.
+
+    :param title: its name for people.
+    :param pi: kc/K_u and ti/P_u.
+    :param pid: kc/K_u, ti/P_u and td/P_u.
+    :param formulas: the same for people, PI first.
+    """
+
+    title: str
+    pi: tuple[float, float]
+    pid: tuple[float, float, float]
+    formulas: tuple[str, str]
+
+
+_ULTIMATE = {
+    # Ziegler and Nichols, "Optimum Settings for Automatic Controllers", Trans. ASME 64, 1942.
+    "ziegler_nichols": _UltimateRule(
+        "Ziegler-Nichols",
+        (0.45, 1.0 / 1.2),
+        (0.6, 0.5, 0.125),
+        ("0.45 K_u and P_u/1.2", "0.6 K_u, P_u/2 and P_u/8"),
+    ),
+    # PI: Tyreus and Luyben, Ind. Eng. Chem. Res. 31, 1992; Thyagarajan and Yu 2003, eqs 31 and 32.
+    # PID: Luyben and Luyben, "Essentials of Process Control", 1997.
+    "tyreus_luyben": _UltimateRule(
+        "Tyreus-Luyben",
+        (1.0 / 3.2, 2.2),
+        (1.0 / 2.2, 2.2, 1.0 / 6.3),
+        ("K_u/3.2 and 2.2 P_u", "K_u/2.2, 2.2 P_u and P_u/6.3"),
+    ),
+}
+
+
+def _by_ultimate_point(name: str, task: DesignTask) -> tuple[Controller, str]:
+    """Return the gains of a rule for the ultimate point.
+
+    :param name: of the rule; one that ends in ``_cycle`` takes the point of the limit cycle by
+        the describing function, else it is that of the model itself.
+    :param task: a stable or integrating process with an ultimate point.
+    :raises TuningError: for any other, or if the limit cycle is not known.
+    """
+    row = _ULTIMATE[name.removesuffix("_cycle")]
+    if name in _ULTIMATE:
+        point, whose = own_point(name, task), "of the model itself"
+    else:
+        point, whose = (
+            describing_point(name, task),
+            "of the limit cycle by the describing function",
+        )
+    pid = wants_pid(name, task)
+    gain, *times = row.pid if pid else row.pi
+    gains = controller(task, gain * point.gain, *(share * point.period for share in times))
+    said = f"K_u = {point.gain:.4g} and P_u = {point.period:.4g} s"
+    return gains, f"{row.title}: {row.formulas[pid]} with {said} {whose}"
+
+
+ziegler_nichols, ziegler_nichols_cycle, tyreus_luyben, tyreus_luyben_cycle = (
+    partial(_by_ultimate_point, f"{name}{end}") for name in _ULTIMATE for end in ("", "_cycle")
+)
+
 
 ITAE_RANGE = (0.1, 1.0)
 _ROUNDING = 1e-9
