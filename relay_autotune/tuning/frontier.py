@@ -136,6 +136,8 @@ class Responses:
         inverse = np.concatenate((self.inverse, self._evaluate(near)), axis=1)
         self._keep(grid[order], inverse[:, order])
 
+    # Where next to nothing passes, inverses overflow, and only endless gains are forbidden.
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def largest_ki(
         self,
         bounds: Bounds,
@@ -170,8 +172,7 @@ class Responses:
         # A loop that begins left of -1 has a real pole there, which moves with the phase.
         turns = np.sign(lead[..., 0] * x[..., 0] - base[..., 0] * y[..., 0])
         count = count + np.where(self._at_rest[of] & (reach[..., 0] > 0.0), turns, 0.0)
-        with np.errstate(invalid="ignore"):
-            crossing = first_crossing(reach, w * (lead + y), kp)
+        crossing = first_crossing(reach, w * (lead + y), kp)
         return envelope(bounds, own, w, (x, y), np.where(count == 0, crossing, 0.0))
 
     def _law(
@@ -247,17 +248,15 @@ def _gained(
         p, q, u, v = (np.broadcast_to(part, above.shape)[k, m, at] for part in (base, lead, x, y))
         return np.asarray((p + 1j * q) / (u + 1j * v))
 
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        before, after = loop(n), loop(n + 1)
-        share = before.imag / (before.imag - after.imag)
-        left = before.real + share * (after.real - before.real) < -1.0
+    before, after = loop(n), loop(n + 1)
+    share = before.imag / (before.imag - after.imag)
+    left = before.real + share * (after.real - before.real) < -1.0
     turned = np.where(left, np.where(after.imag > 0.0, 2.0, -2.0), 0.0)
     size = above.shape[0] * above.shape[1]
     found = np.bincount(which, turned, size).astype(float).reshape(above.shape[:-1])
     if sampled:
         p, q, u, v = base[..., -1], lead[..., -1], x[..., -1], y[..., -1]
-        with np.errstate(over="ignore"):
-            ends_left = p * u + q * v < -(u * u + v * v)
+        ends_left = p * u + q * v < -(u * u + v * v)
         found -= np.where(ends_left, np.sign(q * u - p * v), 0.0)
     return found
 
@@ -280,16 +279,13 @@ def envelope(
     """
     x, y = parts
     p, lead = rest
-    # Where a response is so small that its inverse overflows, only endless gains are forbidden.
-    with np.errstate(over="ignore", invalid="ignore"):
-        square = x * x + y * y
-        rooms = [r * r * square - (p + c * x) ** 2 for c, r in bounds.circles]
+    square = x * x + y * y
+    rooms = [r * r * square - (p + c * x) ** 2 for c, r in bounds.circles]
     edges = []
     for (c, _), room in zip(bounds.circles, rooms, strict=True):
         room = np.where(np.isfinite(room), room, 0.0)
         root = w * np.sqrt(np.maximum(room, 0.0))
-        with np.errstate(over="ignore", invalid="ignore"):
-            middle = w * (lead + c * y)
+        middle = w * (lead + c * y)
         low, high = middle - root, middle + root
         # An ellipse below ki = 0, or where no loop is stable, does not matter.
         forbids = (room > 0.0) & (high > 0.0) & (low < stable[..., None])
@@ -325,8 +321,7 @@ def first_crossing(distance: FloatArray, ki: FloatArray, kp: FloatArray) -> Floa
     """
     before, after = distance[..., :-1], distance[..., 1:]
     crosses = (before > 0.0) != (after > 0.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        share = before / (before - after)
+    share = before / (before - after)
     at = ki[..., :-1] + share * (ki[..., 1:] - ki[..., :-1])
     # Within one cell of the marginal proportional gain the sign of ki is not known.
     near = np.maximum(np.abs(before), np.abs(after)) < _NEAR * kp[:, None, None]
@@ -378,12 +373,11 @@ def _least(values: FloatArray, x: FloatArray) -> FloatArray:
     a, b, c = (np.take_along_axis(values, (i + d)[..., None], -1)[..., 0] for d in (-1, 0, 1))
     least = np.minimum(np.minimum(a, b), c)
     left, right = x[i] - x[i - 1], x[i + 1] - x[i]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        slope_left, slope_right = (b - a) / left, (c - b) / right
-        curvature = (slope_right - slope_left) / (left + right)
-        slope = slope_left + curvature * left
-        bottom = b - 0.25 * slope**2 / curvature
-        inside = (slope_left < 0.0) & (slope_right > 0.0) & np.isfinite(bottom)
+    slope_left, slope_right = (b - a) / left, (c - b) / right
+    curvature = (slope_right - slope_left) / (left + right)
+    slope = slope_left + curvature * left
+    bottom = b - 0.25 * slope**2 / curvature
+    inside = (slope_left < 0.0) & (slope_right > 0.0) & np.isfinite(bottom)
     return np.where(inside, np.minimum(bottom, least), least)
 
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -172,3 +173,16 @@ def test_a_pole_that_is_unstable_below_the_grid_leaves_gains():
     # The backward integral takes half a sample from the proportional gain.
     gains = Controller(kp - 0.5 * period * ki, (kp - 0.5 * period * ki) / ki)
     assert Loop(law.at(gains, period), model).ms() == pytest.approx(1.8, rel=1e-3)
+
+
+def test_where_an_inverse_overflows_the_limits_are_right_and_nobody_is_warned():
+    model = TransferFunction(1.0, (), (1.0, 0.9, 0.8, 0.7))
+    found = []
+    for precision in (np.float32, np.float64):
+        grid = np.geomspace(1e-9, 1e8, 900).astype(precision)
+        kp, tf = np.array([[0.1], [1e6]], precision)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            highs, _ = Responses((model,), grid, 1.0).largest_ki(Bounds(1.6), kp, 0.0 * kp, tf)
+        found.append(highs[0, 0])
+    assert found[0] == pytest.approx(found[1], rel=1e-3)
