@@ -35,7 +35,7 @@ from relay_autotune.identification.result import Identification
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
-from relay_autotune.quantities import NORMAL_95
+from relay_autotune.quantities import LONGEST, NORMAL_95, SHORTEST
 from relay_autotune.record.cycles import cycles_of, limit_cycle
 from relay_autotune.record.record import Cycle, Outcome, Record, one_record
 from relay_autotune.record.thinning import thinned
@@ -268,6 +268,7 @@ def _chosen(record: Record, task: Task) -> _Chosen | Analysis:
     record = thinned(record)
     cycles: tuple[Cycle, ...] = ()
     try:
+        _sampling_period(record)
         cycles = cycles_of(record)
         chosen = _with_remarks(_guarded(record, task.method, task.known), (record,))
     except RelayAutotuneError as error:
@@ -335,6 +336,8 @@ def analyse_jointly(
     first = records[0]
     cycles: tuple[Cycle, ...] = ()
     try:
+        for record in records:
+            _sampling_period(record)
         cycles = cycles_of(first)
         chosen = _with_remarks(identify_jointly(records, method, known), records)
     except RelayAutotuneError as error:
@@ -440,10 +443,24 @@ def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
         settings, half = record.settings, 0.5 * float(np.ptp(record.command))
         options = replace(options, amplitude=half if settings is None else abs(settings.amplitude))
     if options.sample_period == 0.0 and len(record) > 1:
-        period = record.interval if before is None else before.interval
         # Further digits are jitter of the stamps, and no program is set to them.
-        options = replace(options, sample_period=float(f"{period:.3g}"))
+        options = replace(options, sample_period=float(f"{_sampling_period(record):.3g}"))
     return options
+
+
+def _sampling_period(record: Record) -> float:
+    """Return the time between the samples as they were taken [s].
+
+    :raises IdentificationError: if no clock can have given it.
+    """
+    before = record.unthinned
+    period = 0.0 if len(record) < 2 else record.interval if before is None else before.interval
+    if period and not SHORTEST <= period <= LONGEST:
+        raise IdentificationError(
+            f"the samples are {period:.3g} s apart, expected {SHORTEST:g} to {LONGEST:g} s: check "
+            f"the unit of the time"
+        )
+    return period
 
 
 def _describing_point(found: Analysis) -> UltimatePoint | None:

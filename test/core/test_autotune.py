@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sampled_relay import simulate_sampled_relay
 
-from relay_autotune.analysis import analyse, model_so_far
+from relay_autotune.analysis import analyse, analyse_jointly, model_so_far
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.judgement.disturbance import last_cycles
 from relay_autotune.identification.known import Known
@@ -214,3 +214,13 @@ def test_the_end_of_a_disturbed_record_remembers_what_drove_the_process_before()
     np.testing.assert_array_equal(end.input()(earlier), whole.input()(earlier + origin))
     found = identify(end, known=Known(structure="sopdt"))
     assert found.ultimate_gain == pytest.approx(ultimate_point(slow).gain, rel=0.2)
+
+
+def test_times_that_no_clock_gives_are_refused_as_a_wrong_unit():
+    record = _record()
+    wrong = Record(
+        time=1e-10 * record.time, measurement=record.measurement, command=record.command
+    )
+    assert analyse(wrong).best_gains is None
+    assert "check the unit of the time" in analyse(wrong).reason
+    assert "check the unit of the time" in analyse_jointly([wrong, wrong]).reason
