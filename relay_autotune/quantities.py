@@ -203,12 +203,11 @@ def check(values: object, error: type[RelayAutotuneError]) -> None:
 
 @dataclass(frozen=True)
 class ResultField:
-    """A field of a result: what it means, and how documents and messages carry it.
+    """A field of a result: how documents and messages carry it.
 
     :param name: of the field.
     :param kind: its type.
     :param unit: of the number; "" for a pure number, a word or several values.
-    :param meaning: one sentence for people.
     :param default: what stands where it is not told; MISSING: it has to be told.
     :param lower: smallest number allowed.
     :param upper: largest number allowed.
@@ -231,7 +230,6 @@ class ResultField:
     name: str
     kind: Any
     unit: str
-    meaning: str
     default: Any = MISSING
     lower: float = -math.inf
     upper: float = math.inf
@@ -271,21 +269,21 @@ class ResultField:
 
 def result_field(
     unit: str = "", default: Any = MISSING, *, nan: bool | None = None, **carried: Any
-) -> _Field:
+) -> Any:
     """Declare the field of a dataclass as one of a result; arguments as for :class:`ResultField`.
+
+    The docstring below the field says what it means.
 
     :param nan: None: NaN is allowed where it is the default.
     """
     if nan is None:
         nan = isinstance(default, float) and math.isnan(default)
     words = {"unit": unit, "default": default, "nan": nan, **carried}
-    return _Field(default, lambda sentence: {_RESULT: words | {"meaning": sentence}})
+    return field(default=default, metadata={_RESULT: words})
 
 
 def derived(unit: str, *, after: str, column: int = 0) -> Callable[[_Getter], _Getter]:
     """Declare a property of a result that documents and messages carry beside its fields.
-
-    Its docstring is the meaning.
 
     :param unit: of the number.
     :param after: the field that it follows.
@@ -293,9 +291,8 @@ def derived(unit: str, *, after: str, column: int = 0) -> Callable[[_Getter], _G
     """
 
     def declare(getter: _Getter) -> _Getter:
-        meaning = (getter.__doc__ or "").partition("\n")[0]
-        words = {"unit": unit, "meaning": meaning, "after": after, "column": column}
-        setattr(getter, _RESULT, words | {"derived": True})
+        words = {"unit": unit, "after": after, "column": column, "derived": True}
+        setattr(getter, _RESULT, words)
         return getter
 
     return declare

@@ -117,21 +117,24 @@ class Check:
 class Finding:
     """What one check found."""
 
-    name: str = result_field().means("Name of the check.")
-    title: str = result_field().means("Title of the check.")
-    what: str = result_field().means("The measured quantity.")
-    value: float = result_field(nan=True, null=math.inf).means(
-        "The measured number; NaN: not computed."
-    )
-    unit: str = result_field().means("Unit of value and limit.")
-    limit: float = result_field(nan=True, null=math.inf).means(
-        "Largest value of a check that passes; where it failed, of one that does not fail."
-    )
-    result: Result = result_field().means("Result of the check.")
-    sentence: str = result_field("", "").means(
-        "Meaning of a result that did not pass; empty: it passed."
-    )
-    remedy: str = result_field("", "").means("What to do then.")
+    name: str = result_field()
+    """Name of the check."""
+    title: str = result_field()
+    """Title of the check."""
+    what: str = result_field()
+    """The measured quantity."""
+    value: float = result_field(nan=True, null=math.inf)
+    """The measured number; NaN: not computed."""
+    unit: str = result_field()
+    """Unit of value and limit."""
+    limit: float = result_field(nan=True, null=math.inf)
+    """Largest value of a check that passes; where it failed, of one that does not fail."""
+    result: Result = result_field()
+    """Result of the check."""
+    sentence: str = result_field("", "")
+    """Meaning of a result that did not pass; empty: it passed."""
+    remedy: str = result_field("", "")
+    """What to do then."""
 
     @property
     def said(self) -> str:

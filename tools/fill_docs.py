@@ -19,6 +19,9 @@ relay_autotune_msgs/msg/Reason.msg, in which every reason has its constant.
 
 from __future__ import annotations
 
+import ast
+import inspect
+import itertools
 import math
 import re
 import sys
@@ -150,19 +153,37 @@ def laws_table(what: str) -> str:
     return "\n".join(lines)
 
 
+def attribute_docs(kind: type) -> dict[str, str]:
+    """Return the docstrings of a class's attributes, by their names.
+
+    :param kind: the class.
+    """
+    (found,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    assert isinstance(found, ast.ClassDef)
+    docs = {}
+    for attribute, after in itertools.pairwise(found.body):
+        if isinstance(attribute, ast.Assign | ast.AnnAssign) and isinstance(after, ast.Expr):
+            target = (
+                attribute.targets[0] if isinstance(attribute, ast.Assign) else attribute.target
+            )
+            docs[ast.unparse(target)] = " ".join(str(ast.literal_eval(after.value)).split())
+    return docs
+
+
 def reasons_table(first: int) -> str:
     """Return a table of the reasons of a hundred, or of the half of it from 50 on; without notes.
 
     :param first: their first number.
     """
     stop = first + 50 if first % 100 or first == 200 else first + 100
+    meanings = attribute_docs(Code)
     lines = ["| code | sentence | what is behind it, and what to do |", "|---|---|---|"]
     before = ""
     for code in sorted(Code):
-        row = code.row
-        if first <= code < stop and row.meaning:
+        row, meaning = code.row, meanings.get(code.name, "")
+        if first <= code < stop and meaning:
             remedy = row.remedy and f" {row.remedy[0].upper()}{row.remedy[1:]}."
-            found, then = (re.sub(r":[^{}]*}", "}", t) for t in (row.found, row.meaning + remedy))
+            found, then = (re.sub(r":[^{}]*}", "}", t) for t in (row.found, meaning + remedy))
             # What a sentence may leave out, and what it has in common with the one before, is cut.
             whole = re.sub(r"\[[^]]*\]", "", found)
             head, _, last = whole.rpartition("; ")

@@ -37,15 +37,16 @@ class FitProgress:
     :raises ParameterError: if a number is outside its possible range.
     """
 
-    ultimate_gain: float = result_field("u/y", math.nan).means("K_u.")
-    ultimate_gain_std: float = result_field("u/y", math.nan).means("Its standard deviation.")
-    ms: float = result_field("", math.nan).means(
-        "Ms that the gains designed on the model would have."
-    )
-    ms_low: float = result_field("", math.nan).means("Lower end of its 95 % interval.")
-    ms_high: float = result_field("", math.nan).means(
-        "Upper end; inf: some of the loops would be unstable."
-    )
+    ultimate_gain: float = result_field("u/y", math.nan)
+    """K_u."""
+    ultimate_gain_std: float = result_field("u/y", math.nan)
+    """Its standard deviation."""
+    ms: float = result_field("", math.nan)
+    """Ms that the gains designed on the model would have."""
+    ms_low: float = result_field("", math.nan)
+    """Lower end of its 95 % interval."""
+    ms_high: float = result_field("", math.nan)
+    """Upper end; inf: some of the loops would be unstable."""
 
     def __post_init__(self) -> None:
         problem = ""

@@ -26,14 +26,18 @@ DETERMINED = 0.2
 class Combination:
     """A combination of parameters with its uncertainty; NaN: not estimated."""
 
-    name: str = result_field(message="combinations").means("In terms of the parameters.")
-    unit: str = result_field(message="combination_units").means("Unit of the value.")
-    value: float = result_field(nan=True).means("Its value.")
-    std: float = result_field("", math.nan, lower=0.0).means("Its standard deviation.")
-    ci95_low: float = result_field("", math.nan, document="ci95").means(
-        "Lower end of its 95 % interval."
-    )
-    ci95_high: float = result_field("", math.nan, document="ci95").means("Upper end.")
+    name: str = result_field(message="combinations")
+    """In terms of the parameters."""
+    unit: str = result_field(message="combination_units")
+    """Unit of the value."""
+    value: float = result_field(nan=True)
+    """Its value."""
+    std: float = result_field("", math.nan, lower=0.0)
+    """Its standard deviation."""
+    ci95_low: float = result_field("", math.nan, document="ci95")
+    """Lower end of its 95 % interval."""
+    ci95_high: float = result_field("", math.nan, document="ci95")
+    """Upper end."""
 
     @property
     def determined(self) -> bool:
@@ -66,19 +70,20 @@ class Validation:
     the noise of the record's curve subtracted.
     """
 
-    period: float = result_field("", math.nan).means("Difference of the whole period.")
-    period_high: float = result_field("", math.nan).means(
-        "Difference of the time with the command high."
-    )
-    period_low: float = result_field("", math.nan).means(
-        "Difference of the time with the command low."
-    )
-    peak_max: float = result_field("", math.nan).means("Difference of the highest measurement.")
-    peak_min: float = result_field("", math.nan).means("Difference of the lowest measurement.")
-    shape: float = result_field("", math.nan, lower=0.0).means(
-        "Root mean square difference of the two curves."
-    )
-    reason: str = result_field("", "").means("Why there is no limit cycle; empty if there is one.")
+    period: float = result_field("", math.nan)
+    """Difference of the whole period."""
+    period_high: float = result_field("", math.nan)
+    """Difference of the time with the command high."""
+    period_low: float = result_field("", math.nan)
+    """Difference of the time with the command low."""
+    peak_max: float = result_field("", math.nan)
+    """Difference of the highest measurement."""
+    peak_min: float = result_field("", math.nan)
+    """Difference of the lowest measurement."""
+    shape: float = result_field("", math.nan, lower=0.0)
+    """Root mean square difference of the two curves."""
+    reason: str = result_field("", "")
+    """Why there is no limit cycle; empty if there is one."""
 
     @property
     def worst(self) -> float:
@@ -95,27 +100,20 @@ class FitReport:
     ``noise_to_signal`` is N2 of Wang et al. 1997, and ``noise_to_signal_power`` their N1.
     """
 
-    residual_rms: float = result_field("y", math.nan, lower=0.0, column=2).means(
-        "Root mean square of measurement minus model."
-    )
-    noise_std: float = result_field("y", math.nan, lower=0.0).means(
-        "Noise measured before the test."
-    )
-    fit: float = result_field("", math.nan, upper=1.0, column=1).means(
-        "1 - rms(residual)/rms(measurement about its mean)."
-    )
-    whiteness_p: float = result_field("", math.nan, lower=0.0, upper=1.0).means(
-        "Probability of a residual this correlated if it were white (Ljung and Box)."
-    )
-    prediction: float = result_field("y", math.nan, lower=0.0).means(
-        "Root mean square error over the last cycle, predicted from those before."
-    )
-    noise_to_signal: float = result_field("", math.nan, lower=0.0).means(
-        "mean|residual|/mean|model about the operating point|."
-    )
-    noise_to_signal_power: float = result_field("", math.nan, lower=0.0).means(
-        "The same of mean squares."
-    )
+    residual_rms: float = result_field("y", math.nan, lower=0.0, column=2)
+    """Root mean square of measurement minus model."""
+    noise_std: float = result_field("y", math.nan, lower=0.0)
+    """Noise measured before the test."""
+    fit: float = result_field("", math.nan, upper=1.0, column=1)
+    """1 - rms(residual)/rms(measurement about its mean)."""
+    whiteness_p: float = result_field("", math.nan, lower=0.0, upper=1.0)
+    """Probability of a residual this correlated if it were white (Ljung and Box)."""
+    prediction: float = result_field("y", math.nan, lower=0.0)
+    """Root mean square error over the last cycle, predicted from those before."""
+    noise_to_signal: float = result_field("", math.nan, lower=0.0)
+    """mean|residual|/mean|model about the operating point|."""
+    noise_to_signal_power: float = result_field("", math.nan, lower=0.0)
+    """The same of mean squares."""
 
 
 @dataclass(frozen=True)
@@ -146,12 +144,10 @@ class Rival:
     The estimate has a covariance where the support is worth it.
     """
 
-    estimate: Estimate = result_field().means(
-        "The structure's best fit; documents have its model alone."
-    )
-    support: float = result_field(lower=0.0, upper=1.0).means(
-        "Its weight among all structures tried."
-    )
+    estimate: Estimate = result_field()
+    """The structure's best fit; documents have its model alone."""
+    support: float = result_field(lower=0.0, upper=1.0)
+    """Its weight among all structures tried."""
 
     @property
     def model(self) -> TransferFunction:
@@ -174,56 +170,45 @@ class Identification:
     selected model (Thyagarajan and Yu 2003, eqs 29 and 30).
     """
 
-    method: str = result_field(word=True, column=1).means("Name in the registry.")
-    estimate: Estimate = result_field().means("The parameters of the model and their covariance.")
-    ci95_low: FloatArray = result_field(nan=True, document="ci95").means(
-        "Lower ends of the 95 % intervals, shape (p,)."
-    )
-    ci95_high: FloatArray = result_field(nan=True, document="ci95").means(
-        "Upper ends, shape (p,)."
-    )
-    fit: FitReport = result_field("", FitReport()).means("Quality of the fit.")
-    validation: Validation | None = result_field("", None, prefix="validation_").means(
-        "How the limit cycle of the model differs from the record's; None: not compared."
-    )
-    integrated_error: float = result_field("rad/s", math.nan, lower=0.0).means(
-        "Difference from the selected model; NaN: it is that model, or not computed."
-    )
-    points: tuple[FrequencyPoint, ...] = result_field("", (), prefix="point_").means(
-        "Measured points of the frequency response, by rising frequency."
-    )
-    ultimate_gain: float = result_field("u/y", math.nan, column=1).means(
-        "K_u with the sign of the process; NaN: the model has none."
-    )
-    ultimate_gain_std: float = result_field("u/y", math.nan, lower=0.0, column=1).means(
-        "Its standard deviation; NaN: not estimated."
-    )
-    ultimate_frequency: float = result_field("rad/s", math.nan, lower=0.0, column=1).means(
-        "w_u; NaN: the model has none."
-    )
-    ultimate_frequency_std: float = result_field("rad/s", math.nan, lower=0.0, column=1).means(
-        "Its standard deviation; NaN: not estimated."
-    )
-    warnings: tuple[str, ...] = result_field("", ()).means("Sentences that the user must read.")
-    undetermined: tuple[str, ...] = result_field("", ()).means(
-        "Parameters whose 95 % interval is wider than 20 % of the value."
-    )
-    combinations: tuple[Combination, ...] = result_field("", (), prefix="combination_").means(
-        "Where a parameter is not determined, what the data determine all the same."
-    )
-    advice: tuple[str, ...] = result_field("", ()).means(
-        "Then, what test would determine it, each a sentence."
-    )
-    support: float = result_field("", 1.0, lower=0.0, upper=1.0).means(
-        "Weight of this structure among all that were tried; 1: no other was."
-    )
-    rivals: tuple[Rival, ...] = result_field("", (), message=None).means(
-        "Other structures with some support, the best first."
-    )
-    draws: tuple[TransferFunction, ...] = result_field("", (), message=None, optional=True).means(
-        "Models that the record allows, of either direction, each as likely as the others; left "
-        "out: the method knows the covariance alone."
-    )
+    method: str = result_field(word=True, column=1)
+    """Name in the registry."""
+    estimate: Estimate = result_field()
+    """The parameters of the model and their covariance."""
+    ci95_low: FloatArray = result_field(nan=True, document="ci95")
+    """Lower ends of the 95 % intervals, shape (p,)."""
+    ci95_high: FloatArray = result_field(nan=True, document="ci95")
+    """Upper ends, shape (p,)."""
+    fit: FitReport = result_field("", FitReport())
+    """Quality of the fit."""
+    validation: Validation | None = result_field("", None, prefix="validation_")
+    """How the limit cycle of the model differs from the record's; None: not compared."""
+    integrated_error: float = result_field("rad/s", math.nan, lower=0.0)
+    """Difference from the selected model; NaN: it is that model, or not computed."""
+    points: tuple[FrequencyPoint, ...] = result_field("", (), prefix="point_")
+    """Measured points of the frequency response, by rising frequency."""
+    ultimate_gain: float = result_field("u/y", math.nan, column=1)
+    """K_u with the sign of the process; NaN: the model has none."""
+    ultimate_gain_std: float = result_field("u/y", math.nan, lower=0.0, column=1)
+    """Its standard deviation; NaN: not estimated."""
+    ultimate_frequency: float = result_field("rad/s", math.nan, lower=0.0, column=1)
+    """w_u; NaN: the model has none."""
+    ultimate_frequency_std: float = result_field("rad/s", math.nan, lower=0.0, column=1)
+    """Its standard deviation; NaN: not estimated."""
+    warnings: tuple[str, ...] = result_field("", ())
+    """Sentences that the user must read."""
+    undetermined: tuple[str, ...] = result_field("", ())
+    """Parameters whose 95 % interval is wider than 20 % of the value."""
+    combinations: tuple[Combination, ...] = result_field("", (), prefix="combination_")
+    """Where a parameter is not determined, what the data determine all the same."""
+    advice: tuple[str, ...] = result_field("", ())
+    """Then, what test would determine it, each a sentence."""
+    support: float = result_field("", 1.0, lower=0.0, upper=1.0)
+    """Weight of this structure among all that were tried; 1: no other was."""
+    rivals: tuple[Rival, ...] = result_field("", (), message=None)
+    """Other structures with some support, the best first."""
+    draws: tuple[TransferFunction, ...] = result_field("", (), message=None, optional=True)
+    """Models that the record allows, of either direction, each as likely as the others; left
+    out: the method knows the covariance alone."""
     # The model's measurement at the record's samples, with all that was estimated beside the
     # model [y], shape (n,); NaN: not part of the fit; empty: not computed. It is as long as the
     # record, and so in no document or message.

@@ -35,17 +35,16 @@ class Controller:
     :raises TuningError: if a value is not finite, kc is zero or a time is negative.
     """
 
-    kc: float = result_field("u/y", column=1).means(
-        "Proportional gain, with the sign of the process."
-    )
-    ti: float = result_field("s", lower=0.0, column=1).means(
-        "Integral time; 0: no integral action."
-    )
-    td: float = result_field("s", 0.0, lower=0.0, column=1).means("Derivative time.")
-    tf: float = result_field("s", 0.0, lower=0.0, column=1).means(
-        "Time constant of the filter; 0: none."
-    )
-    b: float = result_field("", 1.0, column=1).means("Set-point weight.")
+    kc: float = result_field("u/y", column=1)
+    """Proportional gain, with the sign of the process."""
+    ti: float = result_field("s", lower=0.0, column=1)
+    """Integral time; 0: no integral action."""
+    td: float = result_field("s", 0.0, lower=0.0, column=1)
+    """Derivative time."""
+    tf: float = result_field("s", 0.0, lower=0.0, column=1)
+    """Time constant of the filter; 0: none."""
+    b: float = result_field("", 1.0, column=1)
+    """Set-point weight."""
 
     def __post_init__(self) -> None:
         numbers = (self.kc, self.ti, self.td, self.tf, self.b)
@@ -152,49 +151,37 @@ class Controller:
 class Margins:
     """Margins of a stable loop."""
 
-    ms: float = result_field(lower=0.0, column=1).means(
-        "Largest magnitude of the sensitivity function."
-    )
-    mt: float = result_field(lower=0.0, column=1).means(
-        "Largest magnitude of the complementary sensitivity function."
-    )
-    gain_margin: float = result_field(lower=0.0, null=math.inf, column=1).means(
-        "Factor by which the loop's gain may grow; inf: any."
-    )
-    phase_margin: float = result_field("rad", lower=0.0, null=math.inf, column=1).means(
-        "Phase that the loop may lose."
-    )
-    delay_margin: float = result_field("s", lower=0.0, null=math.inf, column=1).means(
-        "Dead time that may be added; inf: any."
-    )
-    gain_margin_low: float = result_field("", math.nan, lower=0.0, after="iae_load").means(
-        "Factor to which the loop's gain may fall; 0: any. NaN: not computed, here and below."
-    )
+    ms: float = result_field(lower=0.0, column=1)
+    """Largest magnitude of the sensitivity function."""
+    mt: float = result_field(lower=0.0, column=1)
+    """Largest magnitude of the complementary sensitivity function."""
+    gain_margin: float = result_field(lower=0.0, null=math.inf, column=1)
+    """Factor by which the loop's gain may grow; inf: any."""
+    phase_margin: float = result_field("rad", lower=0.0, null=math.inf, column=1)
+    """Phase that the loop may lose."""
+    delay_margin: float = result_field("s", lower=0.0, null=math.inf, column=1)
+    """Dead time that may be added; inf: any."""
+    gain_margin_low: float = result_field("", math.nan, lower=0.0, after="iae_load")
+    """Factor to which the loop's gain may fall; 0: any. NaN: not computed, here and below."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepFigures:
     """Features of the responses of a loop to unit steps."""
 
-    iae_load: float = result_field("y s/u", lower=0.0, null=math.inf, column=1).means(
-        "Integral of the absolute error after a unit step of the load at the process input; inf: "
-        "without integral action."
-    )
-    iae_setpoint: float = result_field("s", math.nan, lower=0.0).means(
-        "Integral of the absolute error after a unit step of the set-point."
-    )
-    overshoot: float = result_field("", math.nan, lower=0.0).means(
-        "After a step of the set-point, relative to it."
-    )
-    settling_time: float = result_field("s", math.nan, lower=0.0).means(
-        "Until the measurement stays within 2 % of a new set-point."
-    )
-    effort_setpoint: float = result_field("u/y", math.nan, lower=0.0).means(
-        "Total variation of the command after a unit step of the set-point."
-    )
-    effort_load: float = result_field("", math.nan, lower=0.0).means(
-        "Total variation of the command after a unit step of the load."
-    )
+    iae_load: float = result_field("y s/u", lower=0.0, null=math.inf, column=1)
+    """Integral of the absolute error after a unit step of the load at the process input; inf:
+    without integral action."""
+    iae_setpoint: float = result_field("s", math.nan, lower=0.0)
+    """Integral of the absolute error after a unit step of the set-point."""
+    overshoot: float = result_field("", math.nan, lower=0.0)
+    """After a step of the set-point, relative to it."""
+    settling_time: float = result_field("s", math.nan, lower=0.0)
+    """Until the measurement stays within 2 % of a new set-point."""
+    effort_setpoint: float = result_field("u/y", math.nan, lower=0.0)
+    """Total variation of the command after a unit step of the set-point."""
+    effort_load: float = result_field("", math.nan, lower=0.0)
+    """Total variation of the command after a unit step of the load."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,10 +191,9 @@ class Performance(StepFigures, Margins):
     :raises TuningError: if a number is negative, or one that is always computed is NaN.
     """
 
-    noise_gain: float = result_field("u/y", math.nan, lower=0.0).means(
-        "Standard deviation of the command over that of white noise in the samples of the "
-        "measurement; without a sampling period the largest gain at any frequency."
-    )
+    noise_gain: float = result_field("u/y", math.nan, lower=0.0)
+    """Standard deviation of the command over that of white noise in the samples of the
+    measurement; without a sampling period the largest gain at any frequency."""
 
     def __post_init__(self) -> None:
         check_told(self, TuningError, "of the gains")
@@ -225,25 +211,23 @@ class Gains(Performance, Controller):
     Ms 1.95, gain margin 2.25
     """
 
-    rule: str = result_field(after="", word=True, column=1).means("Name in the registry.")
-    form: str = result_field("", "isa", after="rule").means("Form in which the rule is stated.")
-    ms_95: float = result_field(nan=True, after="ms", column=1).means(
-        "Ms that 95 % of the models within the uncertainty stay below; NaN: not estimated."
-    )
-    law: str = result_field("", "", word=True, optional=True).means(
-        "Law that they are for; left out: controller_node's, as a continuous controller."
-    )
-    law_period: float = result_field("s", 0.0, lower=0.0, optional=True).means(
-        "Sampling period at which that law runs; left out: no law was named."
-    )
-    bare: Performance | None = result_field("", None, message=None, optional=True).means(
-        "What p, i and d do alone, in a controller with neither filter nor set-point weight; left "
-        "out: the same, for another law, or an unstable loop."
-    )
-    reason: str = result_field().means("Why this rule and these gains, a sentence for people.")
-    warnings: tuple[str, ...] = result_field("", ()).means(
-        "What the user must know before using them."
-    )
+    rule: str = result_field(after="", word=True, column=1)
+    """Name in the registry."""
+    form: str = result_field("", "isa", after="rule")
+    """Form in which the rule is stated."""
+    ms_95: float = result_field(nan=True, after="ms", column=1)
+    """Ms that 95 % of the models within the uncertainty stay below; NaN: not estimated."""
+    law: str = result_field("", "", word=True, optional=True)
+    """Law that they are for; left out: controller_node's, as a continuous controller."""
+    law_period: float = result_field("s", 0.0, lower=0.0, optional=True)
+    """Sampling period at which that law runs; left out: no law was named."""
+    bare: Performance | None = result_field("", None, message=None, optional=True)
+    """What p, i and d do alone, in a controller with neither filter nor set-point weight; left
+    out: the same, for another law, or an unstable loop."""
+    reason: str = result_field()
+    """Why this rule and these gains, a sentence for people."""
+    warnings: tuple[str, ...] = result_field("", ())
+    """What the user must know before using them."""
 
     def __post_init__(self) -> None:
         Controller.__post_init__(self)

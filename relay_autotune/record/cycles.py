@@ -440,8 +440,10 @@ class LimitCycle(CycleFeatures):
 
     # Standard deviation of each of the features between the cycles, by name; 0 for one cycle.
     std: dict[str, float] = field(default_factory=dict)
-    cycles: tuple[int, ...] = result_field("", ()).means("Indices of the cycles averaged.")
-    converged: bool = result_field("", False).means("True if they agree.")
+    cycles: tuple[int, ...] = result_field("", ())
+    """Indices of the cycles averaged."""
+    converged: bool = result_field("", False)
+    """True if they agree."""
 
 
 _AVERAGED = tuple(f.name for f in fields(CycleFeatures))

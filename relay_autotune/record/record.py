@@ -109,30 +109,22 @@ class RelaySettings:
     ``setpoint + hysteresis`` and high when it falls to ``setpoint - hysteresis``.
     """
 
-    setpoint: float = result_field("y", nan=True, lower=-LARGEST, upper=LARGEST).means(
-        "Measurement about which the relay switches."
-    )
-    baseline: float = result_field("u", lower=-LARGEST, upper=LARGEST).means(
-        "Command of the operating point."
-    )
-    amplitude: float = result_field("u", lower=0.0, upper=LARGEST).means(
-        "Half the distance of the two levels, mu."
-    )
-    bias: float = result_field("u", 0.0, lower=-LARGEST, upper=LARGEST).means(
-        "Offset of their middle from the baseline, mu0."
-    )
-    hysteresis: float = result_field("y", 0.0, nan=True, lower=0.0, upper=LARGEST).means(
-        "Half width of the switching band, epsilon."
-    )
-    extra_delay: float = result_field("s", 0.0, lower=0.0, upper=LARGEST).means(
-        "Dead time that the relay added."
-    )
-    sample_period: float = result_field("s", 0.0, lower=0.0, upper=LARGEST).means(
-        "Nominal period of the samples; 0: by their stamps."
-    )
-    reverse_acting: bool = result_field("", False).means(
-        "True if a higher command lowers the measurement."
-    )
+    setpoint: float = result_field("y", nan=True, lower=-LARGEST, upper=LARGEST)
+    """Measurement about which the relay switches."""
+    baseline: float = result_field("u", lower=-LARGEST, upper=LARGEST)
+    """Command of the operating point."""
+    amplitude: float = result_field("u", lower=0.0, upper=LARGEST)
+    """Half the distance of the two levels, mu."""
+    bias: float = result_field("u", 0.0, lower=-LARGEST, upper=LARGEST)
+    """Offset of their middle from the baseline, mu0."""
+    hysteresis: float = result_field("y", 0.0, nan=True, lower=0.0, upper=LARGEST)
+    """Half width of the switching band, epsilon."""
+    extra_delay: float = result_field("s", 0.0, lower=0.0, upper=LARGEST)
+    """Dead time that the relay added."""
+    sample_period: float = result_field("s", 0.0, lower=0.0, upper=LARGEST)
+    """Nominal period of the samples; 0: by their stamps."""
+    reverse_acting: bool = result_field("", False)
+    """True if a higher command lowers the measurement."""
 
     @property
     def high(self) -> float:
@@ -152,35 +144,38 @@ class CycleFeatures:
     The times with the command high and low are T_u1 and T_u2 of Wang et al.
     """
 
-    period: float = result_field("s", nan=True).means("Whole period.")
-    period_high: float = result_field("s", nan=True).means("Time with the command high.")
-    period_low: float = result_field("s", nan=True).means("Time with the command low.")
-    peak_max: float = result_field("y", nan=True).means("Highest measurement, absolute.")
-    peak_min: float = result_field("y", nan=True).means("Lowest measurement, absolute.")
-    time_to_peak_max: float = result_field("s", nan=True).means(
-        "From the switch that turns the measurement down to the maximum."
-    )
-    time_to_peak_min: float = result_field("s", nan=True).means(
-        "From the switch that turns the measurement up to the minimum."
-    )
-    mean_measurement: float = result_field("y", nan=True, message=None).means(
-        "Time average of the measurement."
-    )
-    mean_command: float = result_field("u", nan=True, message=None).means(
-        "Time average of the command."
-    )
+    period: float = result_field("s", nan=True)
+    """Whole period."""
+    period_high: float = result_field("s", nan=True)
+    """Time with the command high."""
+    period_low: float = result_field("s", nan=True)
+    """Time with the command low."""
+    peak_max: float = result_field("y", nan=True)
+    """Highest measurement, absolute."""
+    peak_min: float = result_field("y", nan=True)
+    """Lowest measurement, absolute."""
+    time_to_peak_max: float = result_field("s", nan=True)
+    """From the switch that turns the measurement down to the maximum."""
+    time_to_peak_min: float = result_field("s", nan=True)
+    """From the switch that turns the measurement up to the minimum."""
+    mean_measurement: float = result_field("y", nan=True, message=None)
+    """Time average of the measurement."""
+    mean_command: float = result_field("u", nan=True, message=None)
+    """Time average of the command."""
 
 
 @dataclass(frozen=True)
 class Cycle(CycleFeatures):
     """One whole cycle, from a switch to the high level to the next such switch."""
 
-    index: int = result_field().means("Number of the cycle in its experiment, from 0.")
-    start: float = result_field("s", message=None).means(
-        "Time of the switch that begins it, on the record's time axis."
-    )
-    converged: bool = result_field("", False).means("True if it agrees with the cycles before it.")
-    disturbed: bool = result_field("", False).means("True if it should be left out of averages.")
+    index: int = result_field()
+    """Number of the cycle in its experiment, from 0."""
+    start: float = result_field("s", message=None)
+    """Time of the switch that begins it, on the record's time axis."""
+    converged: bool = result_field("", False)
+    """True if it agrees with the cycles before it."""
+    disturbed: bool = result_field("", False)
+    """True if it should be left out of averages."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,11 +28,12 @@ _SMALL_ANGLE = 0.2
 class FrequencyPoint:
     """The process at one frequency."""
 
-    frequency: float = result_field("rad/s", nan=True).means("w.")
-    value: complex = result_field("y/u", nan=True).means("G(j w).")
-    std: float = result_field("y/u", math.nan, lower=0.0).means(
-        "Standard deviation of its real and of its imaginary part; NaN: not estimated."
-    )
+    frequency: float = result_field("rad/s", nan=True)
+    """w."""
+    value: complex = result_field("y/u", nan=True)
+    """G(j w)."""
+    std: float = result_field("y/u", math.nan, lower=0.0)
+    """Standard deviation of its real and of its imaginary part; NaN: not estimated."""
 
 
 def fourier_integral_held(u: PiecewiseConstant, start: float, end: float, w: float) -> complex:
