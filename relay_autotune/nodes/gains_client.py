@@ -74,14 +74,13 @@ class GainsClient(LoopClient):
         :param leave: returns True to stop waiting.
         :raises LoopError: if it is not there.
         """
-        deadline = time.monotonic() + patience
+        self._answers_within = max(patience, ANSWER_WITHIN)
         if not self.wait(lambda: leave() or self._verify.server_is_ready(), patience):
             there = ", ".join(n for n in self.owners("/verify") if n != self.name) or "none"
             raise LoopError(
                 f"no controller_node {self.name} within {patience:g} s; nodes that verify gains: "
                 f"{there}. Start it{self._start()}, or name another with --namespace and --node"
             )
-        self.require_answer(deadline - time.monotonic(), leave)
         if leave():
             raise LoopError(f"ended while {self.name} was looked for")
 
@@ -390,8 +389,8 @@ class GainsClient(LoopClient):
             sent = self._verify.send_goal_async(
                 goal, feedback_callback=lambda message: tell(visible(message.feedback.status))
             )
-            if not self.wait(sent.done, ANSWER_WITHIN):
-                raise LoopError(f"{self.name} has not answered within {ANSWER_WITHIN:g} s")
+            if not self.wait(sent.done, self._answers_within):
+                raise LoopError(f"{self.name} has not answered within {self._answers_within:g} s")
             answer = self._ended(sent.result(), leave)
             result = made_visible(answer.result)
             if answer.status == GoalStatus.STATUS_SUCCEEDED:

@@ -31,8 +31,8 @@ from relay_autotune.nodes.live_types import CommandMessage, reader_of
 
 # How long present commands are listened to [s].
 _LISTEN = 1.0
-# How long a node may take to answer [s].
-ANSWER_WITHIN = 10.0
+# How long a node may take to answer [s], and after which time one may be asked again.
+ANSWER_WITHIN, _ASK_AGAIN = 10.0, 3.0
 # Messages of a latched topic from before the subscription that are taken.
 _MOST_HEARD = 100
 # Interval in which a message is published until it has arrived [s].
@@ -63,6 +63,9 @@ class LoopClient:
         node, too; None: it has its own.
     :raises ParameterError: if the name is not valid.
     """
+
+    _answers_within = ANSWER_WITHIN
+    # How long its node may take to answer [s]; one that has just started, as it may to start.
 
     def __init__(
         self,
@@ -148,41 +151,36 @@ class LoopClient:
             self.wait(lambda: any(map(wanted, came)), patience)
         return next((message for message in reversed(came) if wanted(message)), None)
 
-    def call(self, kind: Any, service: str, request: Any, patience: float = ANSWER_WITHIN) -> Any:
+    def call(
+        self, kind: Any, service: str, request: Any, patience: float = 0.0, *, again: bool = False
+    ) -> Any:
         """Return the answer of a service.
 
         :param kind: the service class.
         :param service: its full name.
         :param request: what is asked.
-        :param patience: how long to wait for it [s].
+        :param patience: how long to wait for it [s]; 0: as long as its node may take.
+        :param again: True: it may be asked repeatedly, since an answer can be lost where a node
+            does not know this client yet.
         :raises LoopError: if it does not answer.
         """
-        deadline = time.monotonic() + patience
-        if self.wait(self._service(kind, service).service_is_ready, patience):
-            answer = self.begin(kind, service, request)
-            if self.wait(answer.done, deadline - time.monotonic()):
-                return made_visible(answer.result())
-        raise LoopError(f"{service} has not answered within {patience:g} s")
-
-    def require_answer(self, patience: float, leave: Callable[[], bool]) -> None:
-        """Wait until the node answers, which one that has just started may do late.
-
-        :param patience: how long [s]; `ANSWER_WITHIN` at least.
-        :param leave: returns True to stop waiting.
-        :raises LoopError: if it does not answer.
-        """
-        service, answers, asked = f"{self.name}/get_parameters", [], -math.inf
-        is_there = self._service(GetParameters, service).service_is_ready
+        own = service.startswith(f"{self.name}/")
+        patience = patience or (self._answers_within if own else ANSWER_WITHIN)
+        is_there = self._service(kind, service).service_is_ready
+        answers: list[Any] = []
+        asked = -math.inf
 
         def has_answered() -> bool:
             nonlocal asked
-            if time.monotonic() - asked > ANSWER_WITHIN and is_there():
+            is_due = again and time.monotonic() - asked > _ASK_AGAIN
+            if (is_due or not answers) and is_there():
                 asked = time.monotonic()
-                answers.append(self.begin(GetParameters, service, GetParameters.Request()))
-            return leave() or any(answer.done() for answer in answers)
+                answers.append(self.begin(kind, service, request))
+            return any(answer.done() for answer in answers)
 
-        if not self.wait(has_answered, max(patience, ANSWER_WITHIN)):
-            raise LoopError(f"{self.name} is there, but does not answer")
+        if not self.wait(has_answered, patience):
+            raise LoopError(f"{service} has not answered within {patience:g} s")
+        return made_visible(next(answer.result() for answer in answers if answer.done()))
 
     def begin(self, kind: Any, service: str, request: Any) -> Any:
         """Ask a service, and return the future of its answer.
@@ -302,18 +300,16 @@ class LoopClient:
         finally:
             self._node.destroy_publisher(mouth)
 
-    def values(
-        self, node: str, names: Sequence[str], patience: float = ANSWER_WITHIN
-    ) -> dict[str, Any]:
+    def values(self, node: str, names: Sequence[str], patience: float = 0.0) -> dict[str, Any]:
         """Return parameters of a node by name.
 
         :param node: its full name.
         :param names: the parameters.
-        :param patience: how long to wait for them [s].
+        :param patience: how long to wait for them [s]; 0: as long as the node may take.
         :raises LoopError: if it does not answer, or does not have one of them.
         """
         request = GetParameters.Request(names=list(names))
-        answer = self.call(GetParameters, f"{node}/get_parameters", request, patience)
+        answer = self.call(GetParameters, f"{node}/get_parameters", request, patience, again=True)
         found = [parameter_value_to_python(value) for value in answer.values]
         lacking = [n for n, value in zip(names, found, strict=False) if value is None]
         if len(found) != len(names) or lacking:
@@ -331,7 +327,7 @@ class LoopClient:
             parameters=[Parameter(n, value=v).to_parameter_msg() for n, v in values.items()]
         )
         result = self.call(
-            SetParametersAtomically, f"{node}/set_parameters_atomically", request
+            SetParametersAtomically, f"{node}/set_parameters_atomically", request, again=True
         ).result
         if not result.successful:
             raise LoopError(f"{node} refuses {', '.join(values)}: {result.reason}")

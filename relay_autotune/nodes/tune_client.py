@@ -24,7 +24,7 @@ from relay_autotune.exchange.messages import (
 )
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.live_types import CommandMessage, reader_of
-from relay_autotune.nodes.loop_client import LoopClient
+from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
 from relay_autotune.reasons import Code, Reason
 from relay_autotune.record.record import Record
 from relay_autotune_msgs.action import Tune
@@ -93,6 +93,7 @@ class TuneClient(LoopClient):
         from relay_autotune.exchange import models  # noqa: F401
 
         deadline = time.monotonic() + patience
+        self._answers_within = max(patience, ANSWER_WITHIN)
         if not self.wait(lambda: leave() or self._client.server_is_ready(), patience):
             # This client itself appears in the graph under the name that it looks for.
             others = ", ".join(n for n in self.owners("/tune") if n != self.name) or "none"
@@ -100,7 +101,6 @@ class TuneClient(LoopClient):
                 f"no relay_node {self.name} within {patience:g} s; nodes that offer a tune: "
                 f"{others}. Start it, or name another with --namespace and --node"
             )
-        self.require_answer(deadline - time.monotonic(), leave)
         gains = self._resolved("pi_gains")
         if needs_identifier and not self.wait(
             lambda: leave() or self._node.count_publishers(gains) > 0, deadline - time.monotonic()
@@ -121,8 +121,10 @@ class TuneClient(LoopClient):
             Tune.Goal(amplitude=amplitude, dry_run=dry_run),
             feedback_callback=lambda message: self._feedback.append(message.feedback),
         )
-        if not self.wait(sent.done, 10.0):
-            raise LoopError(f"{self.name} has not answered the request within 10 s")
+        if not self.wait(sent.done, self._answers_within):
+            raise LoopError(
+                f"{self.name} has not answered the request within {self._answers_within:g} s"
+            )
         self._goal = sent.result()
         if not self._goal.accepted:
             raise LoopError(f"{self.name} has rejected the request; its log says why")

@@ -22,6 +22,7 @@ import pytest
 import rclpy
 import yaml
 from made_experiments import record_of
+from rcl_interfaces.srv import SetParametersAtomically
 
 from relay_autotune import reasons as core
 from relay_autotune.cli import loops, report, settings, terminal, tune_loop
@@ -80,32 +81,42 @@ def test_a_node_that_was_killed_is_told_with_its_signal(words: str, told: str) -
 
 
 def test_a_node_that_starts_late_is_asked_again_until_it_answers_or_has_ended() -> None:
-    """Its services may be there long before it answers, and a first request can be lost."""
+    """Its services are there long before it answers, and a first answer can be lost."""
     client: Any = LoopClient.__new__(LoopClient)
-    client.name, client.why_lost = "/loop/relay_node", lambda: ""
+    client.name, client.why_lost, client._answers_within = "/loop/node", lambda: "", 200.0
     asked: list[Any] = []
 
     def ask(*_: object) -> Any:
-        answers = bool(asked)
-        asked.append(SimpleNamespace(done=lambda: answers))
+        answers = len(asked) % 2 == 1
+        result = SetParametersAtomically.Response()
+        result.result.successful = True
+        asked.append(SimpleNamespace(done=lambda: answers, result=lambda: result))
         return asked[-1]
 
+    there = SimpleNamespace(service_is_ready=lambda: True, call_async=ask)
     client._services = {
-        "/loop/relay_node/get_parameters": SimpleNamespace(
-            service_is_ready=lambda: True, call_async=ask
-        )
+        f"{node}/{service}": there
+        for node in ("/loop/node", "/other")
+        for service in ("set_parameters_atomically", "revert")
     }
     with pytest.MonkeyPatch.context() as patch:
-        now = iter(range(1000))
+        now = iter(range(10_000))
         patch.setattr(loop_client.time, "monotonic", lambda: float(next(now)))
         client._executor = SimpleNamespace(spin_once=lambda timeout_sec: None)
-        client.require_answer(200.0, lambda: False)
+        client.set_values("/loop/node", {"kc": 1.0})
         assert len(asked) == 2
-        client.require_answer(200.0, lambda: True)
-        client.why_lost = lambda: "relay_node has ended"
-        asked[:] = []
-        with pytest.raises(LoopError, match="relay_node has ended"):
-            client.require_answer(200.0, lambda: False)
+        # What must not be done twice is asked once.
+        with pytest.raises(LoopError, match="/loop/node/revert has not answered within 200 s"):
+            client.call(None, "/loop/node/revert", None)
+        assert len(asked) == 3
+        # A node that this command has not started answers soon, or not at all.
+        asked.append(None)
+        with pytest.raises(LoopError, match="/other/revert has not answered within 10 s"):
+            client.call(None, "/other/revert", None)
+        asked.append(None)
+        client.why_lost = lambda: "node has ended"
+        with pytest.raises(LoopError, match="node has ended"):
+            client.call(None, "/loop/node/revert", None)
 
 
 def test_no_two_joints_share_the_namespace_of_their_nodes() -> None:
