@@ -60,7 +60,7 @@ test-rest: setup-tests
 test-oldest:
 	@$(PYTHON) tools/prepare.py oldest
 	@if [ -d .venv-oldest ]; then \
-		.venv-oldest/bin/python -m pytest -q -m "not nightly and not long" test/core; fi
+		.venv-oldest/bin/python -m pytest -q -m "not nightly and not long" --first-cases test/core; fi
 
 # What the core says must not turn on the last digit, in which the processors' kernels differ. One
 # that a processor lacks falls back to the one before.
@@ -70,7 +70,7 @@ test-nightly: setup-tests
 		OPENBLAS_CORETYPE=$$kernel python3 -m pytest -q test/core || exit 1; done
 	@$(PYTHON) tools/prepare.py oldest
 	@if [ -d .venv-oldest ]; then \
-		.venv-oldest/bin/python -m pytest -q -m "nightly or long" test/core; fi
+		.venv-oldest/bin/python -m pytest -q -m "" test/core; fi
 
 test-web: setup-tests
 	@$(ENTER) && python3 -m pytest -q --require-chromium test/web

@@ -7,6 +7,7 @@ Tests that need a browser are left out where there is none, and a line at the en
 """
 
 import signal
+from collections import Counter
 
 import pytest
 from hypothesis import settings
@@ -30,9 +31,23 @@ def pytest_addoption(parser):
     parser.addoption(
         "--require-chromium", action="store_true", help="fail where there is no Chromium"
     )
+    parser.addoption(
+        "--first-cases", action="store_true", help="run the first case of each test alone"
+    )
 
 
+# Before pytest leaves out what is marked as nightly.
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
+    number = Counter()
+    for item in items:
+        marked = item.get_closest_marker("by_day")
+        if item.get_closest_marker("nightly") or not (marked or config.option.first_cases):
+            continue
+        test = (item.path, item.parent.name, getattr(item, "originalname", item.name))
+        number[test] += 1
+        if number[test] > (1 if config.option.first_cases else marked.args[0]):
+            item.add_marker(pytest.mark.nightly)
     of_browsers = [item for item in items if item.get_closest_marker("browser")]
     if not of_browsers:
         return

@@ -129,7 +129,8 @@ def test_a_given_amplitude_beyond_the_ends_of_the_actuator_never_completes(
     assert command == baseline
 
 
-@pytest.mark.parametrize("share", [0.1, 0.2, 0.4, 0.6])
+@pytest.mark.by_day(2)
+@pytest.mark.parametrize("share", [0.1, 0.6, 0.2, 0.4])
 @pytest.mark.parametrize("std", [0.002, 0.02])
 def test_both_levels_clipped_alike_within_the_limits_are_not_trusted(share, std):
     """True Ms of its gains: 1.9 at six tenths of the amplitude, unstable at two tenths."""

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import replace
 
@@ -45,6 +46,12 @@ def steps(process, *, noise=0.02, seed=3, until=200.0):
     return Record(time=time, measurement=y, command=u(time), held_input=u)
 
 
+@functools.lru_cache(maxsize=8)
+def identified(record):
+    """Return what is identified of a record, once for all tests of it."""
+    return identify(record, "waveform")
+
+
 def other_model(found, model):
     """Return what was identified with another model in its place."""
     own = found.estimate
@@ -54,7 +61,7 @@ def other_model(found, model):
 
 
 def findings(record, model, gains, **more):
-    found = other_model(identify(record, "waveform"), model)
+    found = other_model(identified(record), model)
     loop = Loop(gains, lambda ms: np.array([ms_on(gains, m) for m in ms]), gains.ms)
     evidence = Evidence(record, found, loop=loop, **more)
     return {f.name: f for f in judge(CHECKS, evidence)}
@@ -72,7 +79,7 @@ def gains(record):
 
 def shown_beside(model, record, w):
     """Return mean and scatter of what a record shows beside a model."""
-    found = other_model(identify(record, "waveform"), model)
+    found = other_model(identified(record), model)
     draws = difference(found, record).draws(w, 200)
     return draws.mean(axis=0), draws.std(axis=0)
 
@@ -129,7 +136,7 @@ def test_the_ms_with_a_difference_is_that_of_the_sum(gains):
 
 
 def test_few_samples_are_no_evidence_for_gains(record, gains):
-    found = identify(record, "waveform")
+    found = identified(record)
     some = replace(found, fitted=np.empty(0))
     risk = of_checks(record.part(0, 50), some, gains)["risk"]
     assert (risk.result, math.isnan(risk.value)) == (Result.DOUBTFUL, True)
@@ -159,7 +166,7 @@ def test_a_model_that_would_have_run_away_is_refused(record, gains):
     ("bad", "result"), [(0, Result.PASSED), (20, Result.DOUBTFUL), (60, Result.FAILED)]
 )
 def test_models_on_which_the_loop_is_unstable_are_the_risk(record, gains, bad, result):
-    found = identify(record, "waveform")
+    found = identified(record)
     other = TransferFunction.fopdt(20.0, 10.0, 3.0)
     found = replace(found, draws=(PROCESS,) * (100 - bad) + (other,) * bad)
     risk = of_checks(record, found, gains)["risk"]
@@ -259,7 +266,7 @@ def test_a_process_that_changed_is_drawn_as_each_half_shows_it():
 
 
 def test_gains_that_do_not_hold_on_one_half_are_doubtful(record, gains):
-    found = identify(record, "waveform")
+    found = identified(record)
     other = TransferFunction.fopdt(20.0, 10.0, 3.0)
     late = (other,) * 37 + (PROCESS,) * 3
     halves = (Part(0.0, 100.0, (PROCESS,) * 40), Part(100.0, 200.0, late))
@@ -276,7 +283,7 @@ def test_gains_that_do_not_hold_on_one_half_are_doubtful(record, gains):
 def test_a_half_that_works_in_the_other_direction_gives_no_gains(record, gains, turned, result):
     other = TransferFunction.fopdt(-2.0, 10.0, 3.0)
     half = Part(0.0, 100.0, (other,) * turned + (PROCESS,) * (40 - turned))
-    found = replace(identify(record, "waveform"), halves=(half,))
+    found = replace(identified(record), halves=(half,))
     assert of_checks(record, found, gains)["direction"].result is result
 
 

@@ -161,10 +161,8 @@ def test_steps_of_the_sensor_larger_than_its_noise_are_told_and_widen_the_interv
     assert not any("steps of" in w for w in found.warnings)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_limit_cycle_that_no_structure_explains_gives_a_warning_or_a_reason(seed):
     rng = np.random.default_rng(seed)
     time = np.linspace(0.0, 100.0, 400)

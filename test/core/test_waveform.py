@@ -39,7 +39,7 @@ def _run(gain: float, tau: float, dead: float, bias: float = 0.0, samples: int =
 
 
 @pytest.mark.long
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=8)
 @given(
     gain=st.floats(0.1, 10.0) | st.floats(-10.0, -0.1),
     tau=st.floats(0.1, 100.0),
@@ -84,11 +84,8 @@ def _bound(run: RelayRun, process: tuple[float, float, float], std: float) -> tu
 PROCESSES = [(1.65, 20.0, 10.0), (1.0, 2.0, 2.0), (1.0, 1.0, 0.1), (1.0, 1.0, 10.0)]
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "process",
-    [PROCESSES[0], *(pytest.param(p, marks=pytest.mark.nightly) for p in PROCESSES[1:])],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("process", PROCESSES)
 def test_errors_of_the_ultimate_point_meet_the_cramer_rao_bound(process):
     run, truth = _run(*process), ultimate_point(TransferFunction.fopdt(*process))
     records = [_noisy(run, 0.1, seed) for seed in range(40)]
@@ -240,7 +237,8 @@ def test_data_that_tell_nothing_are_refused_with_the_reason(measurement, command
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [0, 2, 8, 11])
+@pytest.mark.by_day(2)
+@pytest.mark.parametrize("seed", [8, 0, 2, 11])
 def test_noise_shows_no_response_whichever_fits_to_it_run_off(seed):
     """With 0 that turns on the last digit, in 2 and 8 all do, and 11 has none to begin with."""
     noise = np.random.default_rng(seed).standard_normal(100)
