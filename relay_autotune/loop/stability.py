@@ -304,8 +304,8 @@ Loop = Callable[[ComplexArray], ComplexArray]
 # Number of local maxima to refine, since the largest on the grid need not be the largest.
 _PEAKS = 4
 _ZOOMS, _ZOOM_POINTS = 9, 9
-# Number of rounds; each round divides a cell into this many parts.
-_ROUNDS, _PARTS = 13, 16
+# Most rounds for a root, and the change of its logarithm that ends them.
+_ROUNDS, _EXACT = 60, 1e-13
 # Below this magnitude the loop has no influence.
 _RELEVANT = 0.05
 _PER_DECADE = 50
@@ -435,18 +435,25 @@ def _changes(values: FloatArray) -> NDArray[np.intp]:
 def _roots(
     function: Callable[[FloatArray], FloatArray], low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """Return a root in each cell with a change of sign, by dividing all cells at once."""
+    """Return a root in each cell with a change of sign, of all cells at once.
+
+    The Illinois method: a secant between two values of different sign, where an end that stays
+    counts half (Dowell and Jarratt 1971, BIT 11, 168).
+    """
     low, high = np.log(low), np.log(high)
     if not low.size:
         return low
-    above, rows = np.sign(function(np.exp(low))), np.arange(low.size)
+    at_low, at_high = function(np.exp(low)), function(np.exp(high))
     for _ in range(_ROUNDS):
-        ends = np.linspace(low, high, _PARTS + 1, axis=1)
-        signs = np.sign(function(np.exp(ends[:, 1:-1]).ravel())).reshape(low.size, -1)
-        changed = np.column_stack((signs != above[:, None], np.ones(low.size, dtype=bool)))
-        first = np.argmax(changed, axis=1)
-        low, high = ends[rows, first], ends[rows, first + 1]
-    return np.asarray(np.exp(0.5 * (low + high)))
+        x = high - at_high * ((high - low) / (at_high - at_low))
+        value = function(np.exp(x))
+        stays = (value >= 0.0) == (at_high >= 0.0)
+        low, at_low = np.where(stays, low, high), np.where(stays, 0.5 * at_low, at_high)
+        moved = float(np.abs(x - high).max())
+        high, at_high = x, value
+        if moved <= _EXACT:
+            break
+    return np.asarray(np.exp(high))
 
 
 def margins(loop: Loop, grid: FloatArray, at_rest: float | None = None) -> LoopMargins:
