@@ -158,7 +158,8 @@ class HandLoop:
 
         def over() -> bool:
             nonlocal left
-            if begun and during is not None:
+            # Before the step is planned, no time remains.
+            if during is not None and begun and begun[-1].feedback.remaining > 0.0:
                 left -= 1
                 if left <= 0:
                     during()
