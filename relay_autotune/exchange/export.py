@@ -26,6 +26,7 @@ _DIGITS = 10
 # Gains that are for no law in particular can be exported for this one.
 WITHOUT_LAW = "pid_controller"
 LAUNCH = "launch"
+_FILES = {"yaml": "gains.yaml", LAUNCH: "gains.launch.py"}
 EXPORTS = (*LAWS, "yaml", LAUNCH)
 _DOF = re.compile(r"[\w.-]+(/[\w.-]+)*\Z", re.ASCII)
 # Names that YAML reads as text without quotes.
@@ -100,6 +101,14 @@ def exports_of(law: str) -> tuple[str, ...]:
     """
     launched = (LAUNCH,) if law in ("", OWN_LAW) else ()
     return (law or WITHOUT_LAW, "yaml", *launched)
+
+
+def file_name(how: str) -> str:
+    """Return the name of a file that gains are written into.
+
+    :param how: as of :func:`exported`.
+    """
+    return f"{how}.{LAWS[how].ending}" if how in LAWS else _FILES[how]
 
 
 def _doubted(text: str, doubt: str, remark: str) -> str:

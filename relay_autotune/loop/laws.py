@@ -302,6 +302,7 @@ class Law:
     :param remark: beginning of a line that is a comment.
     :param sign: what to know where its gains have not the sign of kc; ``{sign}`` is theirs.
     :param start: how it begins from the present command; None: its program has no way.
+    :param ending: of the name of a file with its settings.
     """
 
     name: str
@@ -325,6 +326,7 @@ class Law:
     remark: str = "#"
     sign: str = ""
     start: Start | None = None
+    ending: str = "yaml"
 
     @property
     def sets_gains(self) -> bool:
@@ -680,6 +682,7 @@ void startController() {
         start=Start(
             "Output is the present command before SetMode(AUTOMATIC).", "StartOutput", needs=True
         ),
+        ending="ino",
     ),
     Law(
         "simple_pid",
@@ -697,6 +700,7 @@ void startController() {
         tail=")\n# pid.setpoint = ...; then, every sample_time: command = pid(measurement)",
         bounds=lambda low, high: (("output_limits", f"({_or_none(low)}, {_or_none(high)})"),),
         start=Start("starting_output is the present command.", "starting_output"),
+        ending="py",
     ),
     Law(
         "esphome_pid",
@@ -737,6 +741,7 @@ void startController() {
         head="# of printer.cfg; likewise [heater_bed] or [heater_generic NAME]\n"
         "[extruder]\ncontrol: pid",
         bounds=lambda _low, high: (("max_power", _or_none(high)),),
+        ending="cfg",
     ),
     Law(
         "marlin_heater",
@@ -758,6 +763,7 @@ void startController() {
         only_positive=True,
         line="#define {name} {value}",
         remark="//",
+        ending="h",
     ),
     Law(
         "px4_rate",
@@ -770,6 +776,7 @@ void startController() {
         slope=Slope.NONE,
         command="normalised torque",
         line="param set {name} {value}",
+        ending="txt",
     ),
     Law(
         "ardupilot_rate",
@@ -795,6 +802,7 @@ void startController() {
         smoothing=_FIRST_ORDER,
         command="normalised torque",
         line="{name},{value}",
+        ending="param",
     ),
     Law(
         "iec_61131_3_pid",
@@ -820,6 +828,7 @@ void startController() {
             "X0",
             lambda law, command: -command / law.gains.kc,
         ),
+        ending="st",
     ),
     Law(
         "oscat_ft_pid",
@@ -836,6 +845,7 @@ void startController() {
             "this block begins at 0, so add the present command to its output Y, and take it "
             "off the limits."
         ),
+        ending="st",
     ),
 )
 

@@ -40,7 +40,7 @@ from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from relay_autotune.errors import RelayAutotuneError, SelectionError, TuningError, defect
-from relay_autotune.exchange.export import exported, exports_of
+from relay_autotune.exchange.export import exported, exports_of, file_name
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.report.page import page as report_page
@@ -521,7 +521,7 @@ class _Export(_Guarded):
         except RelayAutotuneError as error:
             raise HTTPError(HTTPStatus.CONFLICT, reason=_one_line(error)) from error
         self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.set_header("Content-Disposition", f'attachment; filename="{name}.yaml"')
+        self.set_header("Content-Disposition", f'attachment; filename="{file_name(name)}"')
         self.finish(text)
 
 

@@ -202,7 +202,12 @@ def test_gains_are_kept_in_a_file(url):
     status, headers, text = get(url + "gains/yaml?asked=%7B%22ms%22%3A1.6%7D")
     assert status == 200
     assert re.search(r"^kc: 0.8", text, re.MULTILINE)
-    assert headers["Content-Disposition"] == 'attachment; filename="yaml.yaml"'
+    assert headers["Content-Disposition"] == 'attachment; filename="gains.yaml"'
+    asked = quote('{"law": "simple_pid", "sample_period": 0.2}')
+    status, headers, text = get(url + f"gains/simple_pid?asked={asked}")
+    assert status == 200, text
+    assert headers["Content-Disposition"] == 'attachment; filename="simple_pid.py"'
+    assert "from simple_pid import PID" in text
 
 
 def test_the_report_has_the_gains_that_were_shaped(url, subject, monkeypatch):

@@ -228,7 +228,7 @@ function showKeep(exports) {
     button.type = "button";
     button.addEventListener("click", work);
   };
-  keep("Report as one file", () => download("report.html", "tune.html", {}));
+  keep("Report as one file", () => download("report.html", {}));
   for (const name of exports) keep(`Gains for ${name}`, () => exportGains(name));
 }
 
@@ -311,15 +311,17 @@ async function exportGains(name) {
     if (!(await agreed(`These gains are doubtful: ${shaped.doubtful}. The file will say so.`, "Write them all the same"))) return;
     more.accept_doubtful = "yes";
   }
-  await download(`gains/${name}`, `${name}.yaml`, more);
+  await download(`gains/${name}`, more);
 }
 
-async function download(path, file, more) {
+async function download(path, more) {
   const words = new URLSearchParams({ of: chosen, asked: JSON.stringify(asked), ...more });
+  let file = path;
   $("kept").textContent = `writing ${file}`;
   try {
     const answer = await fetch(`${path}?${words}`);
     if (!answer.ok) throw new Error(await answer.text());
+    [, file] = answer.headers.get("Content-Disposition").match(/filename="(.*)"/);
     const link = document.createElement("a");
     link.href = URL.createObjectURL(await answer.blob());
     link.download = file;
