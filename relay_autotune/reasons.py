@@ -59,7 +59,14 @@ class Reason:
     @property
     def typed(self) -> str:
         """The parameter to set, and a value or what it stands for; empty: another remedy."""
-        return _filled(self.code.row.typed, self.values)
+        typed, values = self.code.row.typed, self.values
+        # That of another node may lack a value.
+        return _filled(typed, values) if _names(typed) <= values.keys() else ""
+
+    @property
+    def parameter(self) -> str:
+        """The name of the parameter to set; empty: another remedy."""
+        return self.typed.partition(" ")[0]
 
     def plus(self, *notes: Reason, **values: Value) -> Reason:
         """Return the reason with further notes and values.
@@ -575,6 +582,27 @@ class Code(enum.IntEnum):
     """Parameters hold for a whole tune."""
     REST_UNKNOWN = _Row(317, "not known yet, since few samples have come")
     """The node has just begun to hear the sensor."""
+    STILL_MOVING = _Row(
+        318,
+        "no: {motion} over {span:~}",
+        "wait until the process rests, else the tune waits for that",
+    )
+    """The process moves, or is noisy, before the test."""
+    NO_LIMITS = _Row(
+        319,
+        "{missing} not given: nothing ends a tune whose measurement goes too far that way",
+        typed="{limit} LIMIT",
+    )
+    """measurement_min, measurement_max and max_deviation are at their defaults."""
+    NO_FOLDER = _Row(
+        320,
+        "{folder} cannot be written to: the tune would go on without a recording",
+        "give another record_directory",
+        typed="record_directory FOLDER",
+    )
+    """The folder of the recordings belongs to another user, or is none."""
+    LITTLE_SPACE = _Row(321, "in {folder}, {free:.3g} GB free", typed="record_directory FOLDER")
+    """The disk of the recordings is nearly full."""
     NO_IDENTIFIER = _Row(
         315,
         "no identifier_node: a recording alone, without model and gains",

@@ -164,12 +164,12 @@ class AfterTune:
     def _nothing_started(self) -> int:
         """Print the result of a dry run, or why the node refuses."""
         client, options = self.client, self.options
-        reason, checks = self.result.reason, list(self.result.checks)
+        reason, checks = self.result.reason, self.loop.checklist(self.result)
         if options.json:
             told = {"accepted": client.succeeded, "reason": reason, "checks": checks}
             print(json.dumps({"node": client.name} | told))
         elif checks:
-            print("\n".join(check_lines(self.loop.checklist(checks), width())))
+            print("\n".join(check_lines(checks, width())))
         if not client.succeeded:
             say(PROGRAM, f"{self.loop.title} refuses: {reason}")
             return NOTHING_FOUND

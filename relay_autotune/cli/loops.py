@@ -13,18 +13,19 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.bag.field_path import first_numbers
 from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, ros_arguments
-from relay_autotune.cli.settings import Answers, as_flags, with_flags
+from relay_autotune.cli.settings import Answers, as_flags, flag_to_give
 from relay_autotune.cli.terminal import UNITS, Working, asked, broken, width
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
 from relay_autotune.exchange.export import Target
-from relay_autotune.reasons import Code
+from relay_autotune.exchange.messages import reason_from_message
+from relay_autotune.reasons import Code, Reason
 
 if TYPE_CHECKING:
     from relay_autotune.loop.gains import Controller
@@ -86,9 +87,23 @@ class Loop:
         """Return the arguments for ROS of its own nodes, by the names of their executables."""
         return {}
 
-    def checklist(self, checks: Sequence[str]) -> list[str]:
-        """Return the lines of relay_node's checklist as they are shown."""
-        return list(checks)
+    def checklist(self, result: Any) -> list[str]:
+        """Return the lines of relay_node's checklist, with what to type.
+
+        :param result: the `Tune.Result` of a dry run.
+        """
+        return [
+            f"{check}; {self.to_type(why)}" if why.typed else check
+            for check, why in zip(
+                result.checks, map(reason_from_message, result.refusals), strict=False
+            )
+        ]
+
+    def to_type(self, why: Reason) -> str:
+        """Return what sets the parameter that a reason names."""
+        if self.has_own_nodes:
+            return flag_to_give(why)
+        return f"type: ros2 param set {self.client.name} {why.typed}"
 
     @contextmanager
     def opened(self) -> Iterator[Callable[[int], str]]:
@@ -236,10 +251,6 @@ class TopicLoop(Loop):
         """Take other values of the settings of `form`, also in relay_node."""
         super().set(changed)
         self.client.set_values(self.client.name, self.answers.parameters(self.form[:3]))
-
-    def checklist(self, checks: Sequence[str]) -> list[str]:
-        """Return the lines of relay_node's checklist with flags in place of its parameters."""
-        return list(map(with_flags, checks))
 
     def limits(self) -> tuple[float, ...]:
         """Return the lowest and the highest measurement that a tune may see; empty: not known."""

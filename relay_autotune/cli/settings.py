@@ -22,6 +22,7 @@ from relay_autotune.cli.terminal import UNITS, asked, number_of, pair_of
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import Quantity
+from relay_autotune.reasons import Reason
 from relay_autotune.text import unit_of
 
 NOT_GIVEN = math.nan
@@ -137,16 +138,11 @@ SETTINGS = (
 )  # fmt: skip
 SETTING = {each.name: each for each in SETTINGS}
 _FLAGS = {name: flag_of(each) for each in SETTINGS for name in each.parameters}
-# Where a checklist says which parameter of relay_node to set.
-_TYPED = re.compile(r"; type: ros2 param set \S+ (\w+) \w+$")
 
 
-def with_flags(check: str) -> str:
-    """Return a line of the checklist with the flag to give in place of a node's parameter.
-
-    :param check: the line; its node ends with the command, so that nothing can be set on it.
-    """
-    return _TYPED.sub(lambda found: f"; give {_FLAGS.get(found[1], found[1])}", check)
+def flag_to_give(why: Reason) -> str:
+    """Return what to give in place of a node's parameter that a reason names."""
+    return f"give {_FLAGS.get(why.parameter, why.parameter)}"
 
 
 def as_flags(text: str) -> str:

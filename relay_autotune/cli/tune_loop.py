@@ -299,7 +299,6 @@ class Session:
         with Working("looking at the loop"):
             while True:
                 found = client.check(options.amplitude)
-                checks = list(found.checks)
                 # Right after its start the node does not know all of these yet.
                 awaited = {Code.REST_UNKNOWN, Code.NO_IDENTIFIER}
                 if options.record_only:
@@ -308,7 +307,7 @@ class Session:
                 if not (client.not_ready_yet or lacking) or time.monotonic() > deadline:
                     break
                 time.sleep(TICK)
-        print("\n".join(check_lines(loop.checklist(checks), width())), flush=True, file=sys.stderr)
+        print("\n".join(check_lines(loop.checklist(found), width())), flush=True, file=sys.stderr)
         if not client.succeeded:
             say(PROGRAM, f"{loop.title} refuses: {client.result.reason}")
             return False

@@ -226,7 +226,7 @@ class _LoopOnPage:
         self._live.rest(
             "a tune can start" if accepted else f"refused: {result.reason}",
             good=accepted,
-            checks=tuple(map(check_parts, self._loop.checklist(result.checks))),
+            checks=tuple(map(check_parts, self._loop.checklist(result))),
             checked=self._live.told.checked + 1,
             accepted=accepted,
             limits=self._loop.limits(),

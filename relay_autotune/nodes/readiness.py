@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether a tune can start: the checks before it, and what to type if one of them failed."""
+"""Whether a tune can start: the checks before it, and why one of them failed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from relay_autotune.nodes.parameters import merged, values_of
 from relay_autotune.nodes.quality import described, who, why_no_publisher, why_no_subscriber
 from relay_autotune.nodes.tables import TUNE_PARAMETERS
 from relay_autotune.nodes.watch import LastSamples, Sensor, require_own_time
-from relay_autotune.reasons import Code, Reason, reason_of
+from relay_autotune.reasons import NONE, Code, Reason, reason_of
 from relay_autotune.record.record import Cycle
 from relay_autotune.text import duration
 from relay_autotune_msgs.msg import Reason as ReasonMessage
@@ -58,12 +58,14 @@ class ChecklistLine:
 
     :param mark: how it ended.
     :param name: what was looked at.
-    :param found: what was found, and what to type if it failed.
+    :param found: what was found.
+    :param why: the same for programs, where it failed or is to be known.
     """
 
     mark: Mark
     name: str
     found: str
+    why: Reason = NONE
 
     def __str__(self) -> str:
         return f"{self.mark.value:<4}  {self.name:<{_NAME_WIDTH}}  {self.found}"
@@ -72,24 +74,23 @@ class ChecklistLine:
 class Checklist:
     """Collect checks.
 
-    :param node: full name of the node, for what to type.
     :param stops: True: the first check that fails raises its error; False: all checks are made.
     """
 
-    def __init__(self, node: str, *, stops: bool) -> None:
+    def __init__(self, *, stops: bool) -> None:
         self.checks: list[ChecklistLine] = []
-        self.refusals: list[Reason] = []
-        """Why each check that failed did so."""
-        self.noted: list[Reason] = []
-        """What is no reason not to start, but to be known."""
-        self._node = node
         self.stops = stops
         """True if the first check that fails raises its error."""
 
     @property
+    def refusals(self) -> list[Reason]:
+        """Why each check that failed did so."""
+        return [check.why for check in self.checks if check.mark is Mark.NO]
+
+    @property
     def lines(self) -> list[str]:
         """One line for each check."""
-        return [str(check) for check in self.checks]
+        return list(map(str, self.checks))
 
     def do(self, name: str, work: Callable[[], _T], found: Callable[[_T], str]) -> _T | None:
         """Make a check.
@@ -105,28 +106,21 @@ class Checklist:
             if self.stops:
                 raise
             why = reason_of(error)
-            self.refusals.append(why)
-            self._add(Mark.NO, name, str(why), why.typed)
+            self.checks.append(ChecklistLine(Mark.NO, name, str(why), why))
             return None
-        self._add(Mark.OK, name, found(value))
+        self.checks.append(ChecklistLine(Mark.OK, name, found(value)))
         return value
 
-    def tell(self, name: str, found: str | Reason, good: bool = True, typed: str = "") -> None:
+    def tell(self, name: str, found: str | Reason) -> None:
         """Add a line that is no reason not to start.
 
         :param name: what was looked at.
-        :param found: what was found.
-        :param good: False: there is something to know.
-        :param typed: parameter and value to set where it is not good.
+        :param found: what was found; as a reason, it is to be known.
         """
+        line = ChecklistLine(Mark.OK, name, str(found))
         if isinstance(found, Reason):
-            self.noted.append(found)
-        self._add(Mark.OK if good else Mark.NOTE, name, str(found), "" if good else typed)
-
-    def _add(self, mark: Mark, name: str, found: str, typed: str = "") -> None:
-        if typed:
-            found += f"; type: ros2 param set {self._node} {typed}"
-        self.checks.append(ChecklistLine(mark, name, found))
+            line = ChecklistLine(Mark.NOTE, name, str(found), found)
+        self.checks.append(line)
 
 
 def answer_of(checks: Checklist, **facts: Any) -> StartTune.Response:
@@ -137,9 +131,9 @@ def answer_of(checks: Checklist, **facts: Any) -> StartTune.Response:
     """
     answer = StartTune.Response(**facts) if facts else refused(checks.refusals[0])
     answer.checks = checks.lines
-    for reason in (*checks.refusals, *checks.noted):
+    for check in checks.checks:
         answer.refusals.append(ReasonMessage())
-        fill_reason(answer.refusals[-1], reason)
+        fill_reason(answer.refusals[-1], check.why)
     return answer
 
 
@@ -240,10 +234,10 @@ class Readiness:
         )
         if checks.stops:
             return ready
-        checks.tell("limits", *_limits_of(parameters))
-        checks.tell("at rest", *_rest_of(self._sensor.samples))
-        checks.tell("recording", *_recording_in(values["record_directory"]))
-        checks.tell("model", *_identifier_of(self._node, self._ends.gains.topic_name))
+        checks.tell("limits", _limits_of(parameters))
+        checks.tell("at rest", _rest_of(self._sensor.samples))
+        checks.tell("recording", _recording_in(values["record_directory"]))
+        checks.tell("model", _identifier_of(self._node, self._ends.gains.topic_name))
         checks.tell("expected", _expected(parameters, last))
         checks.tell("time", self.time_of(ready, parameters))
         return None if checks.refusals else ready
@@ -420,26 +414,20 @@ def require_settable(node: Node, changes: Sequence[RosParameter], running: str) 
         ExperimentParameters(**experiment).validate()
 
 
-# Each of these returns what was found, whether that is good, and what to set where it is not.
-_Told = tuple[str | Reason, bool, str]
-
-
-def _rest_of(samples: LastSamples) -> _Told:
+def _rest_of(samples: LastSamples) -> str | Reason:
     """Say whether the measurement is at rest.
 
     :param samples: the last measurements.
     """
     rest = samples.rest()
     if rest is None:
-        return Code.REST_UNKNOWN(), False, ""
-    span = duration(rest.span)
-    if rest.is_steady:
-        return f"{rest.mean:.6g} y with noise of {rest.noise_std:.2g} y over {span}", True, ""
-    waits = "wait until the process rests, else the tune waits for that"
-    return f"no: {rest.motion} over {span}; {waits}", False, ""
+        return Code.REST_UNKNOWN()
+    if not rest.is_steady:
+        return Code.STILL_MOVING(motion=rest.motion, span=rest.span)
+    return f"{rest.mean:.6g} y with noise of {rest.noise_std:.2g} y over {duration(rest.span)}"
 
 
-def _limits_of(parameters: ExperimentParameters) -> _Told:
+def _limits_of(parameters: ExperimentParameters) -> str | Reason:
     """Say which limits of the measurement are missing.
 
     :param parameters: the experiment's parameters.
@@ -448,42 +436,37 @@ def _limits_of(parameters: ExperimentParameters) -> _Told:
     ends = {"measurement_min": low, "measurement_max": high}
     missing = [name for name, value in ends.items() if math.isinf(value)]
     if not missing:
-        return f"a tune ends where the measurement leaves {low:g} to {high:g} y", True, ""
+        return f"a tune ends where the measurement leaves {low:g} to {high:g} y"
     if (most := parameters.max_deviation) > 0.0:
-        return f"a tune ends where the measurement is {most:g} y from its rest", True, ""
-    found = (
-        f"{' and '.join(missing)} not given: nothing ends a tune whose measurement goes too far "
-        f"that way"
-    )
-    return found, False, f"{missing[0]} LIMIT"
+        return f"a tune ends where the measurement is {most:g} y from its rest"
+    return Code.NO_LIMITS(missing=" and ".join(missing), limit=missing[0])
 
 
-def _recording_in(directory: str) -> _Told:
+def _recording_in(directory: str) -> str | Reason:
     """Say whether a recording can be written.
 
     :param directory: folder of the recordings.
     """
     folder = Path(directory).expanduser()
     there = next(path for path in (folder, *folder.parents) if path.exists())
-    typed = "record_directory FOLDER"
     if not (there.is_dir() and os.access(there, os.W_OK)):
-        found = f"{there} cannot be written to: the tune would go on without a recording"
-        return found, False, typed
+        return Code.NO_FOLDER(folder=str(there))
     free = shutil.disk_usage(there).free
-    return f"in {folder}, {free / 1e9:.3g} GB free", free > _LITTLE, typed
+    room = Code.LITTLE_SPACE(folder=str(folder), free=free / 1e9)
+    return str(room) if free > _LITTLE else room
 
 
-def _identifier_of(node: Node, topic: str) -> _Told:
+def _identifier_of(node: Node, topic: str) -> str | Reason:
     """Say whether model and gains will come.
 
     :param node: the node that tunes.
     :param topic: resolved name of the gains' topic.
     """
     if found := ", ".join(who(end) for end in node.get_publishers_info_by_topic(topic)):
-        return f"from {found}", True, ""
+        return f"from {found}"
     there = node.get_namespace()
     named = "" if there == "/" else f" --ros-args -r __ns:={there}"
-    return Code.NO_IDENTIFIER(where=named), False, ""
+    return Code.NO_IDENTIFIER(where=named)
 
 
 def _expected(parameters: ExperimentParameters, last: tuple[float, Cycle] | None) -> str:

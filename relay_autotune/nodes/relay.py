@@ -176,7 +176,7 @@ class RelayNode(ServedNode):
         return self._request(request.amplitude, request.dry_run)
 
     def _request(self, amplitude: float, dry_run: bool) -> StartTune.Response:
-        checks = Checklist(self._name, stops=not dry_run)
+        checks = Checklist(stops=not dry_run)
         try:
             if self._session is not None:
                 raise NotReadyError(Code.RUNNING(tune=self._session.id, node=self._name))

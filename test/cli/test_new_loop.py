@@ -29,7 +29,7 @@ from relay_autotune.cli import loops, report, settings, terminal, tune_loop
 from relay_autotune.cli.after_tune import AfterTune, prefix
 from relay_autotune.cli.loops import Loop, TopicLoop
 from relay_autotune.cli.own_nodes import OwnNodes, namespace_of_joint, ros_arguments
-from relay_autotune.cli.settings import Kind, kind_of, with_flags
+from relay_autotune.cli.settings import Kind, kind_of
 from relay_autotune.cli.terminal import agrees, asked_for_file, broken, number_of, pair_of
 from relay_autotune.errors import LoopError, ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS, Target, exported
@@ -38,6 +38,7 @@ from relay_autotune.nodes import loop_client
 from relay_autotune.nodes.controller import with_gains_file
 from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.nodes.loop_client import LoopClient
+from relay_autotune.nodes.readiness import Checklist, answer_of
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import TransferFunction
@@ -292,10 +293,26 @@ def test_neither_yes_nor_a_law_becomes_the_name_of_a_file(
 
 
 def test_what_failed_names_the_flag_and_no_node_that_ends_with_the_command() -> None:
-    check = "NO    present       too low; type: ros2 param set /t/relay_node measurement_min LIMIT"
-    assert with_flags(check) == "NO    present       too low; give --within"
-    other = "note  model         no identifier_node; type: ros2 run relay_autotune identifier_node"
-    assert with_flags(other) == other
+    """What to set comes from the reason, whatever the line says."""
+    node = Checklist(stops=False)
+    node.tell("limits", Code.NO_LIMITS(missing="measurement_min", limit="measurement_min"))
+    node.tell("model", Code.NO_IDENTIFIER(where=""))
+    node.tell("time", "; type: ros2 param set /t/relay_node amplitude A")
+    answer = answer_of(node, accepted=True)
+    own: Any = TopicLoop.__new__(TopicLoop)
+    limits, model, time = own.checklist(answer)
+    assert limits.startswith("note  limits        measurement_min not given: nothing ends")
+    assert limits.endswith("goes too far that way; give --within")
+    assert [model, time] == answer.checks[1:]
+    other: Any = Loop.__new__(Loop)
+    other.client = SimpleNamespace(name="/t/relay_node")
+    assert other.checklist(answer) == [
+        answer.checks[0] + "; type: ros2 param set /t/relay_node measurement_min LIMIT",
+        *answer.checks[1:],
+    ]
+    # Another node's reason may lack a value.
+    answer.refusals[0].names = answer.refusals[0].values = []
+    assert own.checklist(answer) == answer.checks
 
 
 def test_a_question_shows_what_is_now_and_refuses_what_cannot_be(

@@ -21,6 +21,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_domain import free_domain
 from std_msgs.msg import Float32, Float64
 
+from relay_autotune.exchange.messages import reason_from_message
 from relay_autotune.recordings import read_experiments
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
 
@@ -177,8 +178,8 @@ def test_an_unknown_baseline(idle: Rig) -> None:
         assert set_parameter(idle, "baseline", -2.0).successful
         reason = refused(idle, "is at the actuator's end, command_min -2", amplitude=0.5)
         assert "at which command does the process rest at its working point?" in reason
-        told = idle.ask_for_tune(dry_run=True).checks[0]
-        assert "type: ros2 param set /relay_node baseline COMMAND" in told
+        why = idle.ask_for_tune(dry_run=True).refusals[0]
+        assert reason_from_message(why).typed == "baseline COMMAND"
     assert set_parameter(idle, "baseline", 0.0).successful
 
 
@@ -206,14 +207,15 @@ def test_a_dry_run_says_what_would_be_done_and_moves_nothing(idle: Rig) -> None:
         assert {marks[name] for name in good} == {"ok"}
         assert (marks["limits"], marks["model"]) == ("note", "note")
         assert "/measurement from /onlooker (std_msgs/msg/Float64, reliable), " in found
-        assert "type: ros2 param set /relay_node measurement_min LIMIT" in found
+        assert reason_from_message(answer.refusals[5]).typed == "measurement_min LIMIT"
         assert set_parameter(idle, "measurement_max", -1.0).successful
         try:
             reason = refused(idle, "the measurement is 0, outside of its limits")
             assert "give a higher measurement_max" in reason
-            checks = idle.ask_for_tune(dry_run=True).checks
-            (failed,) = (line for line in checks if line.startswith("NO"))
-            assert failed.endswith("; type: ros2 param set /relay_node measurement_max LIMIT")
+            answer = idle.ask_for_tune(dry_run=True)
+            (failed,) = (n for n, line in enumerate(answer.checks) if line.startswith("NO"))
+            why = reason_from_message(answer.refusals[failed])
+            assert why.typed == "measurement_max LIMIT"
         finally:
             assert set_parameter(idle, "measurement_max", math.inf).successful
 
