@@ -215,6 +215,8 @@ class Identification:
     fitted: FloatArray = field(default_factory=lambda: np.empty(0))
     # How strongly commands above and below the first one act, relative to the model.
     effects: tuple[float, float] = (1.0, 1.0)
+    # Dry friction that was estimated with the model, as a command [u]; 0: none.
+    friction: float = 0.0
     # Standard deviation of the measurement beside drift, past and load, which the model has to
     # explain [y]; NaN: the whole measurement.
     to_explain: float = math.nan

@@ -47,7 +47,10 @@ RESULTS = (
 )
 # As long as the record, and what is told by other fields of the document.
 UNTOLD = {
-    *((Identification, name) for name in ("fitted", "effects", "to_explain", "halves")),
+    *(
+        (Identification, name)
+        for name in ("fitted", "effects", "friction", "to_explain", "halves")
+    ),
     (LimitCycle, "std"),
 }
 POSITIVE = st.floats(1e-3, 1e3)

@@ -63,7 +63,8 @@ def _share(evidence: Evidence) -> Measured | None:
 
 def _limit_cycle(evidence: Evidence) -> Measured | None:
     validation = evidence.found.validation
-    if validation is None or not evidence.settled:
+    if validation is None or not evidence.settled or evidence.found.friction:
+        # The same relay on the model alone moves without the friction.
         return None
     away = abs(validation.period)
     said = f"oscillates with another period, {digits(away, 3)} off"

@@ -56,6 +56,7 @@ from relay_autotune.process.structures import (
     Structure,
 )
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import PiecewiseConstant
 
 MOST_LAGS = 8
 _MOST_LAGS_WITH_ZERO = 4
@@ -67,7 +68,7 @@ _STILL, _STILL_LATER = 0.05, 0.5
 # Least number of moves of a command that tell whether one came before the record.
 _MANY = 6
 # What may be estimated beside the model, as fields of a problem.
-TERMS = ("drift", "relaxation", "past", "unequal", "load")
+TERMS = ("drift", "relaxation", "past", "unequal", "load", "friction")
 # Steps of a fit with a further term; instants at which a load is tried, and steps to the best.
 _STEPS, _INSTANTS, _STEPS_IN_TIME = 15, 60, 4
 # Structures that are fitted to the end, whatever residual they leave.
@@ -84,6 +85,8 @@ _LATE = 0.25
 _LATEST = 0.5
 # Latest turn of an inverse response, in lengths of the test: a later one is a drift.
 _HORIZON = 2.0
+# Least dry friction, as a share of the command's range: the steps of a sensor look like a tenth.
+_LEAST_FRICTION = 0.01
 # Largest share that a FOPDT leaves unexplained which shows the direction of the process.
 _NEARLY_ALL = 0.1
 
@@ -227,6 +230,11 @@ class FitContext:
         if min(problem.effects(state.coefficients)) < 0.0:
             # Commands may lose their effect on one side, but not act the other way there.
             return None
+        u = problem.inputs[0]
+        if problem.friction and isinstance(u, PiecewiseConstant):
+            least = _LEAST_FRICTION * float(np.ptp(u.values))
+            if problem.dry_friction(state.coefficients) < least:
+                return None
         shortest, _ = time_scales(self.problem)
         if is_unobservable(model, shortest, self.length, self.pushed):
             return None
@@ -259,6 +267,9 @@ class FitContext:
                 continue
             if "relaxation" in terms and not candidate.structure.factors:
                 # The free state of an integrator is the offset.
+                continue
+            if "friction" in terms and not candidate.structure.integrators:
+                # It acts against the motion of a position.
                 continue
             if terms == ("load",):
                 problem, state = with_load(candidate.problem, candidate.state)
@@ -297,6 +308,7 @@ class FitContext:
             "unequal": self.problem.acts_both_ways,
             # Between a few steps, a load cannot be told from a slow disturbance.
             "load": self.held and len(self.problem.bounds) == 1,
+            "friction": self.held and bool(self.problem.motions),
         }
         alone: list[tuple[str, ...]] = [(term,) for term in TERMS if needed[term]]
         # Of a movement before the record, either part alone may explain nothing.

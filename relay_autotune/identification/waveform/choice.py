@@ -48,6 +48,7 @@ from relay_autotune.process.structures import (
     LAG_N_ZERO,
     SOPDT,
     SOPDT_ZERO,
+    TABLE,
     THREE_LAGS,
     TWO_EQUAL_ONE,
     UNSTABLE_FOPDT,
@@ -183,7 +184,8 @@ def _compared(context: FitContext, known: Known) -> list[Candidate]:
     if not context.held and not known.structure:
         # What runs away by itself is not recorded, except where a relay held it.
         names = [s.name for s in _TRIED if not s.unstable]
-    simple = context.fit(names if known.structure else _SIMPLE, known.order)
+    first = (*_SIMPLE, INTEGRATOR_LAG.name) if context.problem.motions else _SIMPLE
+    simple = context.fit(names if known.structure else first, known.order)
     if not simple:
         return []
     found: list[Candidate] = []
@@ -193,7 +195,8 @@ def _compared(context: FitContext, known: Known) -> list[Candidate]:
         for each in decided:
             if nuisances_of(each.problem) not in tried:
                 tried.add(nuisances_of(each.problem))
-                other = _of_all(context.with_nuisances_of(each), names, known, simple)
+                some = [n for n in names if TABLE[n].integrators or not each.problem.friction]
+                other = _of_all(context.with_nuisances_of(each), some, known, simple)
                 if not found or (other and other[0].score < found[0].score):
                     found = other
         if not found or known.structure:
@@ -214,7 +217,7 @@ def _with_best_terms(context: FitContext, found: Sequence[Candidate]) -> list[Ca
     """
     ranked = sorted(found, key=lambda c: c.score)
     # A command off the balance of an integrator looks like a drift.
-    starts = ranked[:1] + [c for c in ranked[1:] if c.structure in (FOPDT, IPDT)]
+    starts = ranked[:1] + [c for c in ranked[1:] if c.structure in (FOPDT, IPDT, INTEGRATOR_LAG)]
     reached = []
     for now in starts:
         best = _in_own_colour(context, now)

@@ -114,6 +114,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         draws=allowed.models,
         halves=allowed.halves,
         effects=problem.effects(state.coefficients),
+        friction=problem.dry_friction(state.coefficients),
         to_explain=scale * _spread_beside(problem, state),
     )
     if allowed.temper > 1.0:
@@ -280,6 +281,12 @@ def _warnings(
             f"commands above the first one act {above:.2f} times as strongly as in the model, "
             f"those below it {below:.2f} times: the process is not linear, and the gains hold on "
             "both sides; the weaker direction sets how fast the loop can be"
+        )
+    if fit.problem.friction:
+        friction = fit.problem.dry_friction(fit.state.coefficients)
+        found.append(
+            f"dry friction of {friction:.3g} u was estimated with the model: gains are for the "
+            "motion, and a rest may stay off the set-point by what that command cannot move"
         )
     if fit.problem.load is not None:
         own = len(fit.problem.structure.powers)

@@ -34,6 +34,7 @@ from relay_autotune.identification.waveform.separable import (
     NEGLIGIBLE,
     Problem,
     Trial,
+    motions_of,
     problem_of,
     refine,
 )
@@ -96,7 +97,11 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
         ],
         FOPDT,
     )
-    problem = replace(problem, averaged=any(r.unthinned is not None for r in records))
+    problem = replace(
+        problem,
+        averaged=any(r.unthinned is not None for r in records),
+        motions=motions_of(problem.time, problem.y, inputs[0]) if len(records) == 1 else (),
+    )
     samples, problem = problem.time.size, problem.thinned(_MOST_SAMPLES)
     sign = _sign(records)
     fit = _explained(

@@ -46,6 +46,8 @@ _GROWTH = 4.0
 # Longest lag in lengths of the record: a slower one is an integrator to a thousandth.
 _LONGEST = 1e3
 _WEAK = 1e-11
+# Range of a rest, in steps of the sensor, in which nothing moves.
+_A_STEP = 1.5
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,10 @@ class Problem:
     :param unequal: True: commands above and below the first one have effects of their own.
     :param load: when a step of the load came, in the first experiment [s]; its size and a small
         shift of its time are estimated. None: none came.
+    :param friction: True: dry friction is estimated: a command against each motion, and what it
+        takes of the command while the process stands still.
+    :param motions: the direction in which the measurement moves, 1 or -1, and the command from
+        its first level while it stands still; empty: not seen.
     :param colour: of the noise; None: white.
     :param averaged: True: each sample is the mean of several.
     """
@@ -85,6 +91,8 @@ class Problem:
     past: bool = False
     unequal: bool = False
     load: float | None = None
+    friction: bool = False
+    motions: tuple[PiecewiseConstant, ...] = ()
     colour: Colour | None = None
     averaged: bool = False
 
@@ -128,6 +136,17 @@ class Problem:
         at = coefficients.size - len(self.bounds) * after - count
         share = float(coefficients[at] / coefficients[0])
         return 1.0 + share, 1.0 - share
+
+    def dry_friction(self, coefficients: FloatArray) -> float:
+        """Return the command that dry friction takes from each motion [u]; 0: not estimated.
+
+        :param coefficients: of a fit, shape (k,).
+        """
+        if not self.friction:
+            return 0.0
+        count = len(self.structure.powers)
+        after = count * (2 + self.past + self.unequal + 2 * (self.load is not None))
+        return -float(coefficients[-after - 1 - self.drift] / coefficients[0])
 
     @property
     def experiments(self) -> list[slice]:
@@ -183,6 +202,8 @@ class Problem:
             blocks.append(
                 free_motion(self.structure.denominator, theta, time, growing_only=growing_only)
             )
+        if self.friction:
+            blocks += [self._at_once(theta, time, seen) for seen in self.motions]
         further = []
         if self.past:
             # The level before is that of a step at the first sample, with the same response.
@@ -199,6 +220,14 @@ class Problem:
             return *blocks[0], rest
         columns = np.concatenate([b[0] for b in blocks])
         return columns, np.concatenate([b[1] for b in blocks], axis=1), rest
+
+    def _at_once(
+        self, theta: FloatArray, time: FloatArray, u: PiecewiseConstant
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the response to an input that acts without dead time, with its derivatives."""
+        columns, by_theta = columns_of(self.structure, np.append(theta[:-1], 0.0), time, u)
+        by_theta[-1] = 0.0
+        return columns, by_theta
 
     def seen(self, rows: FloatArray) -> FloatArray:
         """Return rows multiplied by the samples' weights, and whitened by the noise's colour.
@@ -268,6 +297,29 @@ def problem_of(
         np.arange(sum(sizes)),
         tuple(int(b) for b in np.cumsum([0, *sizes[:-1]])),
     )
+
+
+def motions_of(time: FloatArray, y: FloatArray, u: Input) -> tuple[PiecewiseConstant, ...]:
+    """Return in which direction the measurement moves, where its samples show that.
+
+    They do if it rests at one value before the command's first change, to a step of the sensor,
+    and most samples later differ from the one before. In noise no sample tells of a motion.
+
+    :param time: of the samples [s], shape (n,).
+    :param y: the measurement, in any unit, shape (n,).
+    :param u: the command.
+    :return: as ``Problem.motions``.
+    """
+    steps = np.diff(y)
+    first = u.times[0] if u.times.size else math.inf
+    rest, later = steps[time[1:] <= first], steps[time[1:] > first]
+    sizes = np.abs(later[later != 0.0])
+    if not rest.size or 2 * sizes.size <= later.size or not isinstance(u, PiecewiseConstant):
+        return ()
+    if np.ptp(np.cumsum(rest)) > _A_STEP * sizes.min():
+        return ()
+    held = np.where(steps == 0.0, u(time[:-1]) - u.initial, 0.0)
+    return tuple(PiecewiseConstant(time[:-1], x, 0.0) for x in (np.sign(steps), held))
 
 
 @dataclass(frozen=True)
