@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -14,9 +15,10 @@ import pytest
 from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
+from relay_autotune.identification.result import Part
 from relay_autotune.identification.waveform.candidates import Candidate
 from relay_autotune.identification.waveform.fit_covariance import Fit, quantisation_step
-from relay_autotune.identification.waveform.posterior import posterior
+from relay_autotune.identification.waveform.posterior import _apart, posterior
 from relay_autotune.identification.waveform.separable import evaluate, problem_of, refine
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
@@ -177,3 +179,12 @@ def test_a_limit_cycle_that_no_structure_explains_gives_a_warning_or_a_reason(se
         return
     assert np.all(np.isfinite(found.values))
     assert any("not white" in w or "larger than the noise" in w for w in found.warnings)
+
+
+def test_a_half_with_one_model_says_nothing_of_the_scatter_between_halves():
+    one = Part(0.0, 1.0, (TransferFunction.fopdt(2.0, 1.0, 0.5),))
+    three = Part(1.0, 2.0, tuple(TransferFunction.fopdt(g, 1.0, 0.5) for g in (1.0, 1.1, 1.2)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert _apart((one, three), 1.0) == 0.0
+    assert _apart((three, three), 1.0) == pytest.approx(0.0)

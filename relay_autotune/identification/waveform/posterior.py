@@ -224,7 +224,7 @@ def _apart(halves: Sequence[Part], frequency: float) -> float:
     imaginary part, and C the sum of their covariances, it is ``d' C^-1 d/2``: 1 on average for one
     process.
     """
-    if len(halves) < 2:
+    if len(halves) < 2 or any(len(part.models) < 2 for part in halves):
         return 0.0
     found = []
     for part in halves:
