@@ -310,7 +310,9 @@ class Loop:
         """Return where both responses end, and the integrals of both errors [y s]."""
         step = float(setpoint.time[1])
         sampled = self._has_instants(step * setpoint.time.size, setpoint.time.size)
-        s = np.array([1e-8 * frequency], dtype=np.complex128)
+        # Small enough for the limit, and large enough that 1 - exp(-s h) has digits left.
+        digits = math.sqrt(min(frequency * self.law.period, 1.0) or 1.0)
+        s = np.array([1e-8 * frequency / digits], dtype=np.complex128)
         to_setpoint, to_load, *_ = self._closed(s, sampled)
         if self.law.i:
             whole = float(((1.0 - to_setpoint) * self._unit_step(s, sampled))[0].real)

@@ -34,6 +34,8 @@ from relay_autotune.process.transfer_function import TransferFunction
 
 # A dead time of a whole number of periods is recognised in spite of this relative rounding.
 _ROUNDING = 1e-9
+# Largest exponent of z; nothing is left of what came a sample before.
+_LONGEST_SAMPLE = 300.0
 # Terms of the series of exp(x) - 1 for a norm of at most a half.
 _TERMS = 14
 
@@ -143,7 +145,8 @@ class _Held:
 
     def __call__(self, s: ComplexArray) -> ComplexArray:
         """Return the responses at ``z = exp(s h)``, shape (n, m)."""
-        r = np.expm1(s * self._period)[:, None]
+        turn = s * self._period
+        r = np.expm1(np.minimum(turn.real, _LONGEST_SAMPLE) + 1j * turn.imag)[:, None]
         move, states = self._move, [np.ones((1, 1))]
         total = self._out[:, 0] * states[0]
         for i in range(1, self._out.shape[1]):

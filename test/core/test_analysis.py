@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -222,3 +223,21 @@ def test_the_grid_counts_as_the_argument_principle_does_or_not_at_all():
 def test_an_unstable_loop_is_refused_and_says_which():
     with pytest.raises(TuningError, match="unstable loop"):
         analyse_loop(Controller(-1.0, 1.0), TransferFunction.fopdt(1.0, 1.0, 1.0))
+
+
+def test_the_error_of_a_loop_that_runs_far_faster_than_it_answers_is_the_continuous_one():
+    """Near z = 1 few digits are left of 1 - 1/z."""
+    model, gains = TransferFunction.fopdt(2.0, 1e4, 3e3), Controller(0.8, 9e3)
+    continuous = analyse_loop(gains, model).iae_setpoint
+    for period in (1.0, 1e-3, 1e-6):
+        found = analyse_loop(gains, model, period).iae_setpoint
+        assert found == pytest.approx(continuous, rel=1e-3)
+
+
+def test_a_sample_far_longer_than_what_is_looked_at_gives_the_first_response_alone():
+    models = (TransferFunction.fopdt(2.0, 10.0, 3.0), TransferFunction.fopdt(2.0, 12.0, 3.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = ModelSet(models, 1e8)(np.array([0.5 + 1.0j, 1e-12]))
+    assert np.abs(found[0]) == pytest.approx(0.0, abs=1e-30)
+    assert found[1] == pytest.approx(2.0, rel=1e-3)
