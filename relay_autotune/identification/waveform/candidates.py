@@ -40,6 +40,7 @@ from relay_autotune.identification.waveform.starts import (
     latest_dead_times,
     longest_push,
     multistart,
+    shifted_columns,
     start_fopdt,
     start_unstable,
     time_scales,
@@ -448,13 +449,11 @@ def with_load(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
     own, time = len(problem.structure.powers), problem.time
     begin = float(problem.inputs[0].times[0])
     instants = np.linspace(max(begin, float(time[0])), float(time[-1]), _INSTANTS + 2)[1:-1]
-    gained = []
-    for instant in instants:
-        at = replace(few, load=float(instant))
-        rows = at.seen(at.columns(state.theta)[0])[-2 * own - 1 - few.drift :][:own]
-        rows = rows - (rows @ basis) @ basis.T
-        gained.append(float(left @ left) - float(np.sum(left_of(left, rows) ** 2)))
-    load = float(instants[int(np.argmax(gained))])
+    step = PiecewiseConstant(np.zeros(1), np.ones(1), 0.0)
+    answers = few.seen(shifted_columns(few, state.theta, few.time - instants[:, None], step))
+    answers = answers - (answers @ basis) @ basis.T
+    remaining = [float(np.sum(left_of(left, rows) ** 2)) for rows in answers.swapaxes(0, 1)]
+    load = float(instants[int(np.argmin(remaining))])
     theta = state.theta
     for _ in range(_STEPS_IN_TIME):
         loaded = replace(problem, load=load)

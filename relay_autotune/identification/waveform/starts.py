@@ -313,12 +313,12 @@ def _costs(
     along, power, total = (np.zeros(dead_times.size) for _ in range(3))
     for part, u in zip(problem.experiments, problem.inputs, strict=True):
         # A dead time only shifts the response: one pass over shifted samples gives all rows.
-        moved = (problem.time[part] - dead_times[:, None]).ravel()
-        table = _table(problem, theta, moved, dead_times.size, u)
+        moved = problem.time[part] - dead_times[:, None]
+        table = _table(problem, theta, moved, u)
         y = np.tile(problem.y[part] - problem.y[part].mean(), (dead_times.size, 1))
         if problem.past:
             step = PiecewiseConstant(problem.time[part][:1], np.ones(1), 0.0)
-            before = _table(problem, theta, moved, dead_times.size, step)
+            before = _table(problem, theta, moved, step)
             own = np.einsum("dn,dn->d", before, before)
             own[own == 0.0] = 1.0
             before /= np.sqrt(own)[:, None]
@@ -332,16 +332,28 @@ def _costs(
     return np.asarray(total - np.where(refused, 0.0, along**2 / power))
 
 
-def _table(
-    problem: Problem, theta: FloatArray, moved: FloatArray, rows: int, u: Input
-) -> FloatArray:
+def _table(problem: Problem, theta: FloatArray, moved: FloatArray, u: Input) -> FloatArray:
     """Return a lag's responses at moved times about their means, one row for each dead time."""
-    order = np.argsort(moved, kind="stable")
-    columns, _ = columns_of(problem.structure, theta, moved[order], u)
-    r = np.empty(moved.size)
-    r[order] = columns[0]
-    table = r.reshape(rows, -1)
+    table = shifted_columns(problem, theta, moved, u)[0]
     return np.asarray(table - table.mean(axis=1, keepdims=True))
+
+
+def shifted_columns(
+    problem: Problem, theta: FloatArray, moved: FloatArray, u: Input
+) -> FloatArray:
+    """Return a structure's responses at shifted times, in one pass over all of them.
+
+    :param problem: for its structure.
+    :param theta: shape (m,).
+    :param moved: sample times less each shift [s], shape (rows, n).
+    :param u: the input.
+    :return: shape (k, rows, n).
+    """
+    order = np.argsort(moved, axis=None, kind="stable")
+    columns, _ = columns_of(problem.structure, theta, moved.ravel()[order], u)
+    found = np.empty_like(columns)
+    found[:, order] = columns
+    return found.reshape(-1, *moved.shape)
 
 
 @dataclass(frozen=True)
