@@ -210,20 +210,6 @@ class Estimate:
         cut = ~logarithmic & np.isfinite(low)
         return np.where(cut, np.maximum(low, least), low), high
 
-    def _spread(self, logarithmic: NDArray[np.bool_]) -> FloatArray:
-        """Return the covariance of the values, or of the logarithms of some, shape (p, p)."""
-        size = np.where(logarithmic, self.values, 1.0)
-        return np.asarray(self.covariance / np.outer(size, size))
-
-    def _moved(
-        self, change: FloatArray, farthest: float, logarithmic: NDArray[np.bool_]
-    ) -> FloatArray:
-        """Return the values after a change, of the logarithms of some."""
-        with np.errstate(over="ignore"):
-            factors = np.exp(np.clip(change, -farthest, farthest))
-        moved = np.where(logarithmic, self.values * factors, self.values + change)
-        return np.where(logarithmic, moved, np.maximum(moved, self.structure.least))
-
     def ultimate_std(self, gain: float, frequency: float) -> tuple[float, float]:
         """Return the standard deviations of K_u and w_u to first order.
 
@@ -273,14 +259,18 @@ class Estimate:
         :param count: models to draw.
         :param rng: the source.
         """
-        logarithmic = self.structure.logarithmic
+        structure, values = self.structure, self.values
+        # Some parameters have a normal distribution of their logarithm.
+        size = np.where(structure.logarithmic, values, 1.0)
         changes = rng.multivariate_normal(
-            np.zeros(self.values.size),
-            self._spread(logarithmic),
+            np.zeros(values.size),
+            self.covariance / np.outer(size, size),
             count,
             # Undetermined parameters have variances so large that their rounding is not small.
             check_valid="ignore",
             method="eigh",
         )
         for change in changes:
-            yield self.structure.build(self._moved(change, _FARTHEST_DRAWN, logarithmic))
+            factors = np.exp(np.clip(change, -_FARTHEST_DRAWN, _FARTHEST_DRAWN))
+            shifted = np.maximum(values + change, structure.least)
+            yield structure.build(np.where(structure.logarithmic, values * factors, shifted))

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,19 +12,14 @@ from dataclasses import replace
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.errors import IdentificationError, RecordError
-from relay_autotune.identification.limit_cycle.fourier import frequency_point
 from relay_autotune.identification.waveform.residuals import effective_sample_fraction
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.cycles import cycles_of
 from relay_autotune.record.record import PiecewiseConstant, Record
 
 _SURE = 4.5
 _LEAST_ASYMMETRY = 0.05
 _OTHER_AMPLITUDE = 1.2
-_LEAST_DISAGREEMENT = 0.03
-_LEAST_CYCLES = 3
 # Least number of samples in a cycle: with fewer, straight lines between them miss more than 1 %.
 _LEAST_SAMPLES = 24
 # Levels at which the effect of a command may end, in shares of its range; beside its first level.
@@ -213,40 +207,3 @@ def _factors(
     covariance = np.linalg.pinv(scaled @ scaled.T, rcond=_ALIKE**2) * variance
     count = len(parts)
     return factors[:count] / size[:count], (covariance / np.outer(size, size))[:count, :count]
-
-
-def disagreeing_point(record: Record, model: TransferFunction, gain_std: float) -> str | None:
-    """Say whether the model misses the frequency response that Fourier integrals give.
-
-    The point at the fundamental (Wang et al. 1997, eq 23) needs no structure; its scatter from
-    cycle to cycle is its uncertainty.
-
-    :param record: the record, with whole cycles.
-    :param model: the model fitted to it.
-    :param gain_std: relative standard deviation of the model's K_u, which lies near the point.
-    :return: a sentence, or None where the two agree, or the record has no settled limit cycle of
-        enough samples.
-    """
-    bounds = record.cycle_start
-    if len(bounds) <= _LEAST_CYCLES or not math.isfinite(gain_std):
-        return None
-    last = bounds[-_LEAST_CYCLES - 1 :]
-    if min(np.diff(last)) < _LEAST_SAMPLES or not cycles_of(record)[-1].converged:
-        return None
-    try:
-        whole = frequency_point(replace(record, cycle_start=last))
-        singles = [
-            frequency_point(replace(record, cycle_start=pair)) for pair in itertools.pairwise(last)
-        ]
-    except (IdentificationError, RecordError):
-        return None
-    ratios = np.array([s.value / complex(model(1j * s.frequency)) for s in singles])
-    scatter = float(np.std(ratios, ddof=1)) / math.sqrt(len(singles))
-    miss = abs(whole.value / complex(model(1j * whole.frequency)) - 1.0)
-    if miss <= max(_SURE * math.hypot(scatter, gain_std), _LEAST_DISAGREEMENT):
-        return None
-    return (
-        f"the Fourier integrals of the last cycles give a frequency response that is "
-        f"{100.0 * miss:.2g} % off the model's at {whole.frequency:.4g} rad/s: K_u is less "
-        "certain than its interval says"
-    )

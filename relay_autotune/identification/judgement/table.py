@@ -11,7 +11,6 @@ by benchmarks/verdicts.py and shown in docs/verdict.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -24,10 +23,8 @@ from relay_autotune.identification.judgement.evidence import (
     LEAST_SAMPLES,
     MOST_GROWTH,
     Evidence,
-    Loop,
 )
 from relay_autotune.identification.result import NOT_AT_REST
-from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.text import digits
 from relay_autotune.verdict import Check, Measured, not_known
 
@@ -101,14 +98,6 @@ def _risk(evidence: Evidence) -> Measured | None:
     return Measured(share)
 
 
-def _bad(loop: Loop, models: Sequence[TransferFunction], times: float) -> float:
-    """Return the share of models on which gains are unstable, or Ms is that many times the asked.
-
-    A process of the other direction makes the loop unstable.
-    """
-    return float(np.mean(loop.ms_of(models) > times * loop.asked))
-
-
 def _pace(evidence: Evidence) -> Measured | None:
     loop, model = evidence.loop, evidence.found.model
     if loop is None or loop.pace_asked or model.integrators or model.grows:
@@ -126,7 +115,8 @@ def _halves(evidence: Evidence) -> Measured | None:
     if loop is None or not halves:
         return None
     # A half that tells little has models all around that of the whole, and excludes nothing.
-    found = [(_bad(loop, p.models, _IN_HALF) * p.contradicts, p.span) for p in halves]
+    bad = [float(np.mean(loop.ms_of(p.models) > _IN_HALF * loop.asked)) for p in halves]
+    found = [(b * p.contradicts, p.span) for b, p in zip(bad, halves, strict=True)]
     return Measured(*max(found))
 
 

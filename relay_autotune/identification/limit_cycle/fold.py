@@ -34,36 +34,6 @@ from relay_autotune.record.record import PiecewiseConstant, Record, RelaySetting
 
 _RIDGE = 1e-13
 _TOLERANCE = 1e-7
-# Ridge where places are compared: functions that differ by less than its root count as one.
-_ALIKE = 1e-10
-
-
-@dataclass(frozen=True)
-class Kinks:
-    """The functions of a kink at some places, which are the same however many knots there are.
-
-    :param places: phases, shape (m,).
-    :param columns: square roots of the weights times the functions, shape (n, m, kinks).
-    :param gram: products of those of one place, shape (m, kinks, kinks).
-    """
-
-    places: FloatArray
-    columns: FloatArray
-    gram: FloatArray
-
-    @classmethod
-    def at(cls, basis: Basis, places: FloatArray, x: FloatArray, weight: FloatArray) -> Kinks:
-        """Return the functions at some places.
-
-        :param basis: the functions.
-        :param places: phases, shape (m,).
-        :param x: phases of the points, shape (n,).
-        :param weight: number of samples that each point stands for, shape (n,).
-        """
-        columns = np.stack([basis.edges(x, p, 0) for p in places], axis=1)
-        columns = columns * np.sqrt(weight)[:, None, None]
-        by_place = columns.transpose(1, 2, 0)
-        return cls(places, columns, by_place @ by_place.transpose(0, 2, 1))
 
 
 class Spline:
@@ -123,27 +93,12 @@ class Spline:
         rest = self._left - columns @ part
         return float(rest @ rest), np.asarray(part), along
 
-    def searched(self, kinks: Kinks) -> float:
+    def searched(self, places: FloatArray) -> float:
         """Return the place at which a kink leaves the least sum of squares.
 
-        With E the functions of a place, S those of the spline and r its residual, E reduces the
-        sum of squares by ``r'E (E'E - E'S (S'S)^-1 S'E)^-1 E'r``. This is less exact than
-        :meth:`fitted`, but good enough for the choice.
-
-        :param kinks: the functions of each place, weighted as the points are.
+        :param places: phases, shape (m,).
         """
-        places, functions = kinks.places.size, self._basis.kinks
-        flat = kinks.columns.reshape(self._x.size, -1)
-        across = self._transposed @ flat
-        found, _ = dpotrs(self._factor[0], across, self._factor[1])
-        shape = (-1, places, functions)
-        own = np.einsum("kpi,kpj->pij", across.reshape(shape), found.reshape(shape))
-        gram = kinks.gram - own
-        size = np.sqrt(np.maximum(np.einsum("pii->pi", gram), 1e-300))
-        gram = gram / (size[:, :, None] * size[:, None, :]) + _ALIKE * np.eye(functions)
-        along = (self._left @ flat).reshape(places, functions) / size
-        taken = np.einsum("pi,pi->p", along, np.linalg.solve(gram, along[:, :, None])[:, :, 0])
-        return float(kinks.places[np.argmax(taken)])
+        return float(places[np.argmin([self._kinked(p)[0] for p in places.tolist()])])
 
     def refined(self, near: float, places: FloatArray) -> float:
         """Return the best place of a kink between the two places about one.
@@ -592,7 +547,6 @@ def _smoothed(
     floor = n * (_NEGLIGIBLE * float(np.ptp(y))) ** 2 or 1e-300
     best: tuple[Spline, float] | None = None
     least, worse, edge = math.inf, 0, math.nan
-    kinks = Kinks.at(basis, places, x, weight)
     for half in _KNOTS:
         knots = half if mirrored else 2 * half
         if best is not None and (n < _SAMPLES_PER_KNOT * knots or worse > _PATIENCE):
@@ -600,7 +554,7 @@ def _smoothed(
         worse += 1
         spline = Spline(basis, knots, x, value, weight)
         if half <= _SEARCHED:
-            edge = spline.searched(kinks)
+            edge = spline.searched(places)
         edge = spline.refined(edge, places)
         for place in (edge,) if sharp else (math.nan, edge):
             coefficients, cost = spline.fitted(place)

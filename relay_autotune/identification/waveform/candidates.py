@@ -72,8 +72,6 @@ _MANY = 6
 TERMS = ("drift", "relaxation", "past", "unequal", "load", "friction")
 # Steps of a fit with a further term; instants at which a load is tried, and steps to the best.
 _STEPS, _INSTANTS, _STEPS_IN_TIME = 15, 60, 4
-# Structures that are fitted to the end, whatever residual they leave.
-_ALWAYS = (FOPDT.name, IPDT.name)
 
 # Twice the logarithm of the prior odds against a term that can imitate a drift, for which a
 # record without one has no use: 150 to 1.
@@ -413,7 +411,8 @@ class FitContext:
         if structure == UNSTABLE_FOPDT:
             return self.unstable
         growing = math.exp(float(self.unstable.theta[0])) if structure.unstable else math.nan
-        if structure.name in _ALWAYS:
+        if structure == IPDT:
+            # A command off its balance leaves a drift, which is a term of its own.
             least = math.inf
         return multistart(problem, self.guess.starts(structure, growing), TRIAL, least)
 

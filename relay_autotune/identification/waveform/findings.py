@@ -18,7 +18,6 @@ from scipy.special import stdtrit
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate
-from relay_autotune.identification.judgement.checks import disagreeing_point
 from relay_autotune.identification.result import (
     NOT_AT_REST,
     FitReport,
@@ -103,9 +102,6 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     )
     # One of each opposite pair: the other one has the same square.
     gain_std, frequency_std = point_stds(found, allowed.mixture[::2])
-    error = gain_std / abs(found.ultimate_gain)
-    notes = [disagreeing_point(record, found.model, error) for record in records]
-    found = replace(found, warnings=(*found.warnings, *dict.fromkeys(n for n in notes if n)))
     found = _with_rivals(found, fit, shares)
     found = replace(
         found,

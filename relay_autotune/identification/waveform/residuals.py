@@ -27,33 +27,24 @@ def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
     e = residual - residual.mean()
     if not bool(np.any(e)):
         return np.zeros(lags)
-    products = _products(e[None, :], lags)[0, 0]
+    # By Fourier transforms, padded so that the ends do not meet: a million samples take no longer
+    # than the fit itself.
+    spectrum = np.abs(np.fft.rfft(e, 2 ** math.ceil(math.log2(e.size + lags + 1)))) ** 2
+    products = np.fft.irfft(spectrum)[: lags + 1]
     return np.asarray(products[1:] / products[0])
 
 
-def effective_sample_fraction(residual: FloatArray, errors: float = 0.0) -> float:
+def effective_sample_fraction(residual: FloatArray) -> float:
     """Return the number of independent samples that one correlated sample is worth, up to 1.
 
     With a correlation rho of neighbours, n samples tell no more than ``n (1 - rho)/(1 + rho)``
     independent ones.
 
     :param residual: shape (n,), in the order of time.
-    :param errors: largest correlation that counts as zero, in standard errors.
     """
     n = residual.size
     rho = float(autocorrelation(residual, 1)[0])
-    if rho <= errors / math.sqrt(n):
-        return 1.0
-    return max((1.0 - rho) / (1.0 + rho), 1.0 / n)
-
-
-def _products(x: FloatArray, lags: int) -> FloatArray:
-    """Return ``sum_t x_i(t + lag) x_j(t)`` for lags 0 to ``lags``, shape (p, p, lags + 1)."""
-    # By Fourier transforms, padded so that the ends do not meet: a million samples take no
-    # longer than the fit itself.
-    transform = np.fft.rfft(x, 2 ** math.ceil(math.log2(x.shape[1] + lags + 1)))
-    spectrum = transform[:, None, :] * transform.conj()[None, :, :]
-    return np.asarray(np.fft.irfft(spectrum)[..., : lags + 1])
+    return min(max((1.0 - rho) / (1.0 + rho), 1.0 / n), 1.0)
 
 
 def noise_to_signal(noise: FloatArray, signal: FloatArray) -> tuple[float, float]:

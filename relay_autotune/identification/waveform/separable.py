@@ -510,7 +510,6 @@ def information_criterion(
     samples: int,
     parameters: int,
     floor: float,
-    effective_sample_fraction: float = 1.0,
 ) -> float:
     """Return the Bayesian information criterion, ``n log(cost/samples) + p log n``.
 
@@ -518,7 +517,6 @@ def information_criterion(
     :param samples: number of samples.
     :param parameters: p, number of estimated parameters.
     :param floor: sum of squares that is rounding: smaller ones count as equal to it.
-    :param worth: number of independent samples that each is worth; n is the product.
     """
-    n = samples * effective_sample_fraction
-    return n * math.log(max(cost, floor) / samples) + parameters * math.log(max(n, 3.0))
+    likely = samples * math.log(max(cost, floor) / samples)
+    return likely + parameters * math.log(max(samples, 3.0))
