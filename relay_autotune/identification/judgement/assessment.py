@@ -25,6 +25,7 @@ from relay_autotune.identification.limit_cycle.fold import Fold, as_switched, fo
 from relay_autotune.identification.limit_cycle.fourier import SteadyState, steady_state
 from relay_autotune.identification.result import FitReport, Identification, Validation
 from relay_autotune.identification.waveform.residuals import ljung_box, noise_to_signal
+from relay_autotune.identification.waveform.separable import NEGLIGIBLE
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
@@ -217,7 +218,6 @@ def integrated_error(
     return float(np.sum(weights * integrand) * step / 3.0)
 
 
-_NEGLIGIBLE = 1e-10
 # More different commands than these in a cycle are not those of a relay.
 _LEVELS = 6
 
@@ -276,7 +276,7 @@ def fit_of_model(model: TransferFunction, record: Record, rest: float) -> FitRep
     residual = residual - columns @ np.linalg.lstsq(columns, residual, rcond=None)[0]
     rms = math.sqrt(float(np.mean(residual**2)))
     spread = float(np.std(y))
-    exact = rms <= _NEGLIGIBLE * float(np.ptp(y))
+    exact = rms <= NEGLIGIBLE * float(np.ptp(y))
     power, mean = noise_to_signal(residual, y - residual - rest)
     return FitReport(
         residual_rms=rms,

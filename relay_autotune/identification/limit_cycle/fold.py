@@ -196,8 +196,9 @@ _PATIENCE = 2
 # Number of knots up to which the kink is searched for everywhere; with more, near the last one.
 _SEARCHED = 16
 _NEGLIGIBLE = 1e-9
-_SYMMETRIC = 0.05
-_NO_BIAS = 0.01
+# Halves that differ by less of the period count as equal, and a relay with less bias as unbiased.
+SYMMETRIC = 0.05
+NO_BIAS = 0.01
 _GRID = 2001
 _DEVIATIONS = 6.0
 _SHARE = 0.02
@@ -273,13 +274,22 @@ class Fold:
         if math.isnan(self.edge):
             return ends
         kinks = self(np.array([self.edge, self.period_high + self.edge]))
-        allowed = _DEVIATIONS * self.curve_std + _SHARE * 0.5 * (ends[1] - ends[0])
+        allowed = self.tolerance
         low = max(float(np.min(kinks)), self.lowest)
         high = min(float(np.max(kinks)), self.highest)
         return (
             low if low <= ends[0] + allowed else ends[0],
             high if high >= ends[1] - allowed else ends[1],
         )
+
+    @property
+    def tolerance(self) -> float:
+        """How much lower than the highest point a kink may lie and still be the peak [y].
+
+        At a kink the curve is less certain than on average, and splines swing a little about it.
+        """
+        swing = 0.5 * float(np.ptp(self(np.linspace(0.0, self.period, _GRID))))
+        return _DEVIATIONS * self.curve_std + _SHARE * swing
 
     def half(self, time: FloatArray) -> FloatArray:
         """Return the deviation after the switch that turns the measurement down, of both halves.
@@ -344,8 +354,8 @@ def fold_without(
     return _average(record, rest, fold(record, cycles, sharp=sharp), sharp=False)
 
 
-# Of many cycles, not every one is left out.
-_LEAST_CYCLES, _MOST_PARTS = 3, 20
+# Least number of cycles that have a scatter; of many, not every one is left out.
+LEAST_CYCLES, _MOST_PARTS = 3, 20
 
 
 @dataclass(frozen=True)
@@ -379,7 +389,7 @@ class Reading:
         """
         count = len(cycles)
         values, covariance = measure(fold(record, cycles, sharp=sharp)), None
-        if count >= _LEAST_CYCLES:
+        if count >= LEAST_CYCLES:
             left_out = cycles[:: -(-count // _MOST_PARTS)]
             parts = np.array([measure(fold_without(record, cycles, c, sharp)) for c in left_out])
             away = parts - np.mean(parts, axis=0)
@@ -424,9 +434,9 @@ def _average(record: Record, cycles: tuple[int, ...], like: Fold | None, *, shar
     assert settings is not None
     bounds = record.cycle_start or find_cycles(record)
     since, is_high, y, high, low = _overlaid(record, settings, bounds, cycles)
-    mirrored = abs(settings.bias) <= _NO_BIAS * settings.amplitude and abs(
+    mirrored = abs(settings.bias) <= NO_BIAS * settings.amplitude and abs(
         high - low
-    ) <= _SYMMETRIC * (high + low)
+    ) <= SYMMETRIC * (high + low)
     if like is not None:
         mirrored = like.mirrored
     if mirrored:

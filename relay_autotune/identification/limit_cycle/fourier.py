@@ -15,6 +15,7 @@ import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.limit_cycle.fold import LEAST_CYCLES
 from relay_autotune.identification.limit_cycle.limit_cycle import RelayTest
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
@@ -156,8 +157,8 @@ def cycle_means(record: Record, start: float, end: float) -> tuple[float, float]
 
 _LEAST_BIAS = 0.02
 _LEAST_SAMPLES = 8
-# Least number of cycles that have a scatter, and number that gives it within 10 %.
-_LEAST_CYCLES, _MOST_SINGLES = 3, 60
+# Number of cycles that gives their scatter within 10 %.
+_MOST_SINGLES = 60
 
 UNKNOWN_REST = (
     "no samples at rest before the test: the set-point stands in for the steady state, and the "
@@ -246,7 +247,7 @@ def static_gain(test: RelayTest, rest: SteadyState) -> StaticGain:
     count = ends.size - 1
     stride = -(-count // _MOST_SINGLES)
     each = [ratio(*ends[i : i + 2].tolist())[0] for i in range(0, count, stride)]
-    known = len(each) >= _LEAST_CYCLES
+    known = len(each) >= LEAST_CYCLES
     scatter = float(np.std(each, ddof=1)) / math.sqrt(count) if known else math.nan
     return StaticGain(value, scatter, excursion)
 

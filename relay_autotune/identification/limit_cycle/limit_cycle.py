@@ -14,6 +14,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.limit_cycle.fold import NO_BIAS, SYMMETRIC
 from relay_autotune.record.cycles import (
     LimitCycle,
     cycles_of,
@@ -28,8 +29,6 @@ from relay_autotune.record.record import PiecewiseConstant, Record, RelaySetting
 _OFF_LEVEL = 0.05
 _MOST_BETWEEN = 0.01
 _LEAST_SAMPLES = 4
-_MOST_BIAS = 0.01
-_MOST_SKEW = 0.05
 
 NOT_SETTLED = "the limit cycle had not settled: its last cycles still differ"
 
@@ -61,7 +60,7 @@ class RelayTest:
 
         :raises IdentificationError: if the bias is more than 1 % of the relay's amplitude.
         """
-        if abs(self.settings.bias) > _MOST_BIAS * self.settings.amplitude:
+        if abs(self.settings.bias) > NO_BIAS * self.settings.amplitude:
             raise IdentificationError(
                 f"the relay had a bias of {self.settings.bias:g}, but the equations of "
                 f"{self.method} hold for a symmetric one: use the method wang_biased or waveform"
@@ -87,7 +86,7 @@ class RelayTest:
         """
         found = [] if self.cycle.converged else [NOT_SETTLED]
         skew = abs(self.cycle.period_high - self.cycle.period_low) / self.cycle.period
-        if symmetric and skew >= _MOST_SKEW:
+        if symmetric and skew >= SYMMETRIC:
             found.append(
                 f"the half periods differ by {100.0 * skew:.0f} % of the period: the set-point is "
                 "not where the process rests, or the load changed; the equations are those of "

@@ -159,8 +159,6 @@ FLAT = 0.42
 
 _GRID = 2001
 _SHARP_FOPDT = 0.2
-_DEVIATIONS = 6.0
-_SHARE = 0.02
 
 
 class Curve(Protocol):
@@ -410,10 +408,7 @@ def shape_of_fold(period: Fold, growth: float = math.nan) -> Shape:
     """
     # The switch to low begins the half above the set-point; if reverse-acting, the one below.
     sign = -1.0 if period.settings.reverse_acting else 1.0
-    # At an edge the curve is less certain than on average, and splines swing a little about it.
-    swing = 0.5 * float(np.ptp(period(np.linspace(0.0, period.period, _GRID))))
-    tolerance = _DEVIATIONS * period.curve_std + _SHARE * swing
-    hints = {"edge": period.edge, "tolerance": tolerance}
+    hints = {"edge": period.edge, "tolerance": period.tolerance}
     low = shape_of_curve(_Half(period, period.period_high, sign), period.period_low, **hints)
     high = shape_of_curve(_Half(period, 0.0, -sign), period.period_high, **hints)
     means = {f.name: 0.5 * (getattr(low, f.name) + getattr(high, f.name)) for f in fields(Shape)}

@@ -70,8 +70,9 @@ _STILL, _STILL_LATER = 0.05, 0.5
 _MANY = 6
 # What may be estimated beside the model, as fields of a problem.
 TERMS = ("drift", "relaxation", "past", "unequal", "load", "friction")
-# Steps of a fit with a further term; instants at which a load is tried, and steps to the best.
-_STEPS, _INSTANTS, _STEPS_IN_TIME = 15, 60, 4
+# Steps of a fit with a further term or in another colour; instants at which a load is tried, and
+# steps to the best.
+STEPS, _INSTANTS, _STEPS_IN_TIME = 15, 60, 4
 
 # Twice the logarithm of the prior odds against a term that can imitate a drift, for which a
 # record without one has no use: 150 to 1.
@@ -275,7 +276,7 @@ class FitContext:
             else:
                 changed: dict[str, Any] = dict.fromkeys(terms, True)
                 problem = replace(candidate.problem, **changed)
-                state = refine(problem, candidate.state.theta, tolerance=TRIAL, most=_STEPS)
+                state = refine(problem, candidate.state.theta, tolerance=TRIAL, most=STEPS)
                 anew = self._anew(problem, terms)
                 if anew:
                     state = min(state, best_of(problem, anew), key=lambda s: s.cost)
@@ -456,7 +457,7 @@ def with_load(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
     theta = state.theta
     for _ in range(_STEPS_IN_TIME):
         loaded = replace(problem, load=load)
-        found = refine(loaded, theta, tolerance=TRIAL, most=_STEPS)
+        found = refine(loaded, theta, tolerance=TRIAL, most=STEPS)
         theta = found.theta
         step, pulse = found.coefficients[[-2 * own - 1 - problem.drift, -own - 1 - problem.drift]]
         shift = -float(pulse / step) * problem.shortest if step else 0.0

@@ -20,6 +20,7 @@ import numpy as np
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.candidates import (
+    STEPS,
     Candidate,
     FitContext,
     as_in,
@@ -82,7 +83,6 @@ _HOPELESS = 30.0
 # Length of the record in correlation times of the slow disturbance that is tried first.
 _SLOWEST = 10.0
 _ALIKE = 0.01
-_STEPS = 15
 # Gain in the score that the best of all dead times and structures reaches on noise alone.
 _SEARCHED = 10.0
 # Scores that differ by less do not tell two structures apart.
@@ -110,11 +110,11 @@ def chosen_fit(problem: Problem, known: Known, sign: int, scale: float, *, held:
     found = [c for c in found if few.may_be_chosen(c) or sign * c.model.process_sign < 0]
     own = [c for c in found if few.may_be_chosen(c)]
     if found and sign and not known.structure:
-        turned = (few.refit(c, found[0].problem.colour, _STEPS) for c in few.turned())
+        turned = (few.refit(c, found[0].problem.colour, STEPS) for c in few.turned())
         found = [*found, *(c for c in turned if c is not None)]
     # Where a disturbance that no term describes made a colour that explains the response, too,
     # the simulation shows it.
-    white = (few.refit(c, None, _STEPS) for c in own if c.problem.colour is not None)
+    white = (few.refit(c, None, STEPS) for c in own if c.problem.colour is not None)
     simulated = sorted((c for c in white if c is not None), key=lambda c: c.score)
     for candidate in (*_by_rank(own), *_by_rank(simulated)):
         fit = _finished(candidate, found, problem, scale)
@@ -138,7 +138,7 @@ def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candid
     for c in found:
         if c.score <= found[0].score + _HOPELESS:
             problem = drop_first_dead_time(as_in(c.problem, context.problem), c.state)
-            state = refine(problem, c.state.theta, tolerance=TRIAL, most=_STEPS)
+            state = refine(problem, c.state.theta, tolerance=TRIAL, most=STEPS)
             if c is found[0] and _colour(problem, state) is not None:
                 return found
             again.append(context.candidate(problem, state))
@@ -202,7 +202,7 @@ def _compared(context: FitContext, known: Known) -> list[Candidate]:
         if not found or known.structure:
             break
         # The best structure of all may need others than the simple ones.
-        again = _with_best_terms(context, [context.refit(found[0], None, _STEPS) or found[0]])
+        again = _with_best_terms(context, [context.refit(found[0], None, STEPS) or found[0]])
         decided = [
             c for c in again if c.score < found[0].score and nuisances_of(c.problem) not in tried
         ]
@@ -235,7 +235,7 @@ def _with_best_terms(context: FitContext, found: Sequence[Candidate]) -> list[Ca
 def _in_own_colour(context: FitContext, candidate: Candidate) -> Candidate:
     """Return a candidate in the colour of its residual, or white where that is likelier."""
     colour = _colour(candidate.problem, candidate.state)
-    coloured = None if colour is None else context.refit(candidate, colour, _STEPS)
+    coloured = None if colour is None else context.refit(candidate, colour, STEPS)
     return candidate if coloured is None else min(candidate, coloured, key=lambda c: c.score)
 
 
@@ -280,7 +280,7 @@ def _converged(
 
 def _in(colour: Colour | None, found: list[Candidate], context: FitContext) -> list[Candidate]:
     """Return candidates fitted in one colour, the best first."""
-    again = (context.refit(c, colour, _STEPS) for c in found)
+    again = (context.refit(c, colour, STEPS) for c in found)
     return sorted((c for c in again if c is not None), key=lambda c: c.score)
 
 

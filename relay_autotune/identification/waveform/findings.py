@@ -40,6 +40,7 @@ from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.separable import (
     NEGLIGIBLE,
+    TRIAL,
     Problem,
     Trial,
     evaluate,
@@ -55,7 +56,6 @@ _UNEXPLAINED = 1.5
 _UNEQUAL = 0.05
 _WORTH_TELLING = 1e-3
 _OPEN = 0.01
-_PREDICTED = 1e-6
 
 
 def report(records: Sequence[Record], fit: Fit) -> Identification:
@@ -221,7 +221,7 @@ def _prediction(records: Sequence[Record], problem: Problem, state: Trial) -> fl
     if before.relaxation or before.drift or before.structure.unstable:
         # These terms depend on where the samples begin and end.
         return math.nan
-    earlier = refine(before, state.theta, tolerance=_PREDICTED)
+    earlier = refine(before, state.theta, tolerance=TRIAL)
     error = last.y - earlier.coefficients @ evaluate(last, earlier.theta).columns
     return math.sqrt(float(np.mean(error**2)))
 

@@ -32,6 +32,7 @@ from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import scale_of, weights
 from relay_autotune.identification.waveform.separable import (
     NEGLIGIBLE,
+    TRIAL,
     Problem,
     Trial,
     motions_of,
@@ -55,7 +56,6 @@ _MOST_LATE, _DIVIDED = 0.05, 0.5
 # Ratio of two records' noise up to which they count as equal.
 _ALIKE = 1.2
 _MOST_ROUNDS = 20
-_SETTLED = 1e-6
 _STEADY = 0.02
 _LEAST_NOISE = 1e-3
 
@@ -157,7 +157,7 @@ def _by_noise(problem: Problem, fit: Fit, chosen: Callable[[Problem], Fit]) -> F
     for _ in range(_MOST_ROUNDS):
         # The noisy experiments pulled the fit, which changed the noise found in the others.
         earlier, part = noise, _weighted(part, noise)
-        state = refine(part, state.theta, tolerance=_SETTLED)
+        state = refine(part, state.theta, tolerance=TRIAL)
         noise = _noise_of_each(part, state)
         if float(np.abs(noise / earlier - 1.0).max()) <= _STEADY:
             break
@@ -221,9 +221,9 @@ def _reweighted(whole: Problem, fit: Fit, loss: str, base: FloatArray) -> Fit:
         residual = own * raw_residual(problem, state)
         scale = max(scale_of(residual), NEGLIGIBLE)
         problem = replace(problem, weight=own * np.sqrt(weights(residual, scale, loss)))
-        earlier, state = state, refine(problem, state.theta, tolerance=_SETTLED)
+        earlier, state = state, refine(problem, state.theta, tolerance=TRIAL)
         change = np.abs(state.theta - earlier.theta) / unit_steps(problem.structure, state.theta)
-        if float(change.max()) <= _SETTLED:
+        if float(change.max()) <= TRIAL:
             break
     return replace(fit, problem=problem, state=state, base=own, loss=loss)
 
