@@ -453,8 +453,8 @@ def listed_records(
 ) -> Sorted | None:
     """Return what `sorted_records` would, without going from record to record.
 
-    Where each place that is listed holds a message of its channel, and each message ends where
-    another one begins, or the content ends, nothing else is in it.
+    Where each place that is listed holds a message of its channel, and all of them together are as
+    long as the content, nothing else is in it.
 
     :param content: the records.
     :param listed: where messages are said to begin, by channel, shape (n,) each.
@@ -462,27 +462,32 @@ def listed_records(
     :param declared: the channels that there are.
     :return: None: not all of that is so.
     """
-    begins, ends = [np.array([len(content)])], [np.array([0])]
-    found: dict[int, Messages] = {}
     last = len(content) - _HEAD.itemsize
-    for channel, at in listed.items():
-        rising = bool((at[1:] > at[:-1]).all())
-        if channel not in declared or not rising or not at.size or at[0] < 0 or at[-1] > last:
-            return None
-        heads = _heads(content, at)
-        # One beyond the signed range is negative here.
-        length = heads["length"].astype(np.int64)
-        right = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == channel)
-        right &= (length >= MESSAGE_HEAD_SIZE) & (length <= last + MESSAGE_HEAD_SIZE - at)
-        if not right.all():
-            return None
-        begins.append(at)
-        ends.append(at + (length + RECORD.size))
-        if channel in wanted:
-            found[channel] = _messages_at(content, at, heads, ends[-1])
-    # The places of each channel rise: a stable sort only merges them, twenty times as fast.
-    begin, end = (np.sort(np.concatenate(some), kind="stable") for some in (begins, ends))
-    return Sorted(found, _NOWHERE, _NOWHERE, 0) if np.array_equal(begin, end) else None
+    at = np.concatenate(list(listed.values())) if listed else _NOWHERE
+    if not at.size or int(at.min()) < 0 or int(at.max()) > last or listed.keys() - set(declared):
+        return None
+    sizes = [places.size for places in listed.values()]
+    heads = _heads(content, at)
+    # One beyond the signed range is negative here.
+    length = heads["length"].astype(np.int64)
+    right = heads["channel"] == np.repeat(np.array(list(listed), np.uint16), sizes)
+    right &= (heads["opcode"] == Opcode.MESSAGE) & (length >= MESSAGE_HEAD_SIZE)
+    right &= length <= last + MESSAGE_HEAD_SIZE - at
+    if not right.all():
+        return None
+    end = at + (length + RECORD.size)
+    # They begin at different places, and together they have all of its bytes.
+    if int((end - at).sum()) != len(content):
+        return None
+    found: dict[int, Messages] = {}
+    stops = np.cumsum(sizes).tolist()
+    for channel, size, stop in zip(listed, sizes, stops, strict=True):
+        if channel in wanted and size:
+            own = slice(stop - size, stop)
+            if bool((at[own][1:] <= at[own][:-1]).any()):
+                return None
+            found[channel] = _messages_at(content, at[own], heads[own], end[own])
+    return Sorted(found, _NOWHERE, _NOWHERE, 0)
 
 
 def _chosen(values: NDArray[Any], chosen: NDArray[np.bool_]) -> NDArray[Any]:
