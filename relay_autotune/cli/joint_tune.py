@@ -544,6 +544,8 @@ class JointLoop(Loop):
                 values[name] = clamp
         # Not before, since relay_node refuses a second publisher of the reference.
         self.nodes.start("controller_node", ros_arguments(self._space, topics, values))
+        why_inactive = self._manager.still_active(loop.controller)
+        self.client.why_lost = lambda: self.nodes.why_lost() or why_inactive()
         try:
             return apply_at(
                 own_node(self.options, "controller_node"),

@@ -16,12 +16,14 @@ import pytest
 import yaml
 from toolbox_pid import ToolboxPid
 
+from relay_autotune.cli import joint_tune
 from relay_autotune.cli.joint_tune import JointLoop
 from relay_autotune.errors import LoopError
 from relay_autotune.loop import laws
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes import ros2_control
 from relay_autotune.nodes.gains_place import controller_of, mapping_of
+from relay_autotune.nodes.loop_client import GoneError
 from relay_autotune.nodes.ros2_control import (
     TRAJECTORY_CONTROLLER,
     ControllerManager,
@@ -450,3 +452,31 @@ def test_a_joint_that_is_commanded_by_another_name_or_tells_no_output() -> None:
 def test_a_trajectory_controller_without_gains_in_use_is_refused(parameters, told) -> None:
     with pytest.raises(LoopError, match=told):
         joint_loop(Arm(**parameters), Arm(), "arm", "arm_2")
+
+
+def test_a_controller_that_is_switched_off_ends_the_proof_and_gets_its_reference(monkeypatch):
+    """Without a command of the controller, its controller_node waits for one in vain."""
+    manager, did = Switching(), []
+    loop = SimpleNamespace(
+        controller="pid", node="/pid", places={"p": "p"}, why_not_moved="", clamps=(-1.0, 1.0),
+        feedforward=0.0, state=SimpleNamespace(reference=1.0),
+    )  # fmt: skip
+    tune = SimpleNamespace(
+        _loop=loop, _manager=manager, _at_controller=lambda: ({}, {}), _space="/tune",
+        client=SimpleNamespace(),
+        options=SimpleNamespace(keep_gains=False, yes=True, namespace="tune"),
+        _put_back=lambda: did.append("reference"),
+        nodes=SimpleNamespace(
+            start=lambda name, _: did.append(name), end=did.append, why_lost=lambda: ""
+        ),
+    )  # fmt: skip
+
+    def proof(*_, **__):
+        assert tune.client.why_lost() == ""
+        manager.switch([], ["pid"])
+        raise GoneError(tune.client.why_lost())
+
+    monkeypatch.setattr(joint_tune, "apply_at", proof)
+    with pytest.raises(GoneError, match="pid is off"):
+        JointLoop.apply(tune, "")
+    assert did == ["controller_node", "controller_node", "reference"]
