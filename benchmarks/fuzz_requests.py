@@ -42,9 +42,9 @@ from rclpy.parameter import Parameter
 from ros_domain import free_domain
 from served import analysed, conversation, served, subject_of
 
+from relay_autotune.analysis import PARAMETERS
 from relay_autotune.exchange.messages import float64_array
 from relay_autotune.loop.laws import LAWS
-from relay_autotune.nodes.identifier_parameters import PARAMETERS
 from relay_autotune.nodes.tables import TUNE_PARAMETERS
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import RULES

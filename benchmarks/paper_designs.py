@@ -25,12 +25,11 @@ from markdown import table, three
 
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import analyse_loop, is_stable
-from relay_autotune.loop.gains import ControlLaw, Controller, Performance
+from relay_autotune.loop.gains import ControlLaw, Controller, Performance, SeriesForm
 from relay_autotune.process.structures import INTEGRATOR_INVERSE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import RULES, design
 from relay_autotune.tuning.compensators import dead_time_compensator, high_order_compensator
-from relay_autotune.tuning.forms import SeriesForm
 from relay_autotune.tuning.rules.formulas import describing_point_of
 from relay_autotune.tuning.rules.step_response import two_point_fopdt
 from relay_autotune.tuning.task import DesignOptions, DesignTask

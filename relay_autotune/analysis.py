@@ -5,14 +5,16 @@
 
 Live nodes and replay share this path.
 The experiments of one recording are tests of one process: :func:`agreed` compares them.
+``PARAMETERS`` are those of identifier_node: method, rule, known process values, design options.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +37,7 @@ from relay_autotune.identification.result import Identification
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
-from relay_autotune.quantities import LONGEST, NORMAL_95, SHORTEST
+from relay_autotune.quantities import LONGEST, NORMAL_95, SHORTEST, Quantity, declared
 from relay_autotune.record.cycles import cycles_of, limit_cycle
 from relay_autotune.record.record import Cycle, Outcome, Record, one_record
 from relay_autotune.record.thinning import thinned
@@ -574,3 +576,50 @@ def _apart(a: Identification, b: Identification) -> float:
     width = NORMAL_95 * (a.ultimate_gain_std + b.ultimate_gain_std)
     apart = abs(a.ultimate_gain - b.ultimate_gain) - width
     return apart if math.isfinite(apart) else 0.0
+
+
+# Measured by the experiment, so they are no parameters.
+_MEASURED = ("noise_std", "amplitude")
+# Renamed, because the plain name would mean something else beside a controller's parameters.
+_PREFIXED = {"gain": "known_gain", "dead_time": "known_dead_time"}
+
+KNOWN = tuple(
+    replace(each, name=_PREFIXED.get(each.name, each.name), flag=each.name)
+    for each in declared(Known)
+)
+DESIGN = tuple(each for each in declared(DesignOptions) if each.name not in _MEASURED)
+PARAMETERS = (
+    Quantity("method", DEFAULT_METHOD, choices=tuple(METHODS)).means(
+        "Method whose model is published."
+    ),
+    Quantity("rule", DEFAULT_RULE, choices=tuple(RULES)).means("Rule whose gains are published."),
+    *KNOWN,
+    *DESIGN,
+)
+
+
+def known_from(values: Mapping[str, Any]) -> Known:
+    """Return the known values of the process.
+
+    :param values: of the parameters, by name.
+    :raises ParameterError: if a value is out of its range, or the gain is zero.
+    """
+    return Known(**{each.flag: values[each.name] for each in KNOWN})
+
+
+def options_from(values: Mapping[str, Any]) -> DesignOptions:
+    """Return the design options of the controller.
+
+    :param values: of the parameters, by name.
+    :raises TuningError: if a value is out of its range.
+    """
+    return DesignOptions(**{each.name: values[each.name] for each in DESIGN})
+
+
+def task_from(values: Mapping[str, Any]) -> Task:
+    """Return how a record is to be identified and a controller to be designed.
+
+    :param values: of the parameters, by name.
+    :raises RelayAutotuneError: if a value is out of its range, or a name is unknown.
+    """
+    return Task(values["method"], values["rule"], known_from(values), options_from(values))

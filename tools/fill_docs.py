@@ -30,9 +30,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+from relay_autotune.analysis import PARAMETERS as IDENTIFIER_PARAMETERS
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.loop.laws import LAWS, Law
-from relay_autotune.nodes.identifier_parameters import PARAMETERS as IDENTIFIER_PARAMETERS
 from relay_autotune.nodes.plant import PARAMETERS as PLANT_PARAMETERS
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS, FIXED_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.quantities import Quantity

@@ -229,7 +229,7 @@ def _pyarrow() -> Any:
 _CONNECT_S = 10.0
 _PRELOADED = [
     f"relay_autotune.{name}"
-    for name in ("threads", "analysis", "recordings", "cli.jobs", "exchange.document")
+    for name in ("threads", "analysis", "recordings", "cli.jobs", "exchange.models")
 ]
 
 Work = Callable[[Job], Done]

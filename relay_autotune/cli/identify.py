@@ -19,8 +19,8 @@ from relay_autotune.cli.arguments import DONE, finite, run_command, with_negativ
 from relay_autotune.cli.table import identification_lines
 from relay_autotune.cli.terminal import labelled, width
 from relay_autotune.errors import ParameterError, SelectionError, look_up
-from relay_autotune.exchange.document import to_json
 from relay_autotune.exchange.fields import to_document
+from relay_autotune.exchange.models import to_json
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle

@@ -214,7 +214,7 @@ def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> s
             return ""
         return table(job.name, analyses, job.table_width)
     # Imported here, since a table for people does not need it.
-    from relay_autotune.exchange.document import document, to_json
+    from relay_autotune.exchange.models import document, to_json
 
     return to_json(document(job.name, analyses, error=error))
 

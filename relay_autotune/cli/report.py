@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from relay_autotune.analysis import analyse
+from relay_autotune.analysis import PARAMETERS, analyse, task_from
 from relay_autotune.cli.arguments import (
     DONE,
     NOTHING_FOUND,
@@ -33,7 +33,6 @@ from relay_autotune.cli.jobs import Job, add_analysis, analysed, jobs_of
 from relay_autotune.cli.terminal import ProgressLine, Stages
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
 from relay_autotune.loop.gains import Controller
-from relay_autotune.nodes.identifier_parameters import PARAMETERS, task_from
 from relay_autotune.record.record import Record
 from relay_autotune.report import PICTURES, is_ours, write_figures, write_page, write_picture
 from relay_autotune.result import Analysis

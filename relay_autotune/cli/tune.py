@@ -33,12 +33,11 @@ from relay_autotune.cli.jobs import add_design, add_export, design_options, expo
 from relay_autotune.cli.table import gains_lines
 from relay_autotune.cli.terminal import in_columns, labelled, width, write
 from relay_autotune.errors import ModelError, SelectionError, TuningError
-from relay_autotune.exchange.document import to_json
 from relay_autotune.exchange.export import exported
 from relay_autotune.exchange.fields import to_document
-from relay_autotune.exchange.models import model_fields
+from relay_autotune.exchange.models import model_fields, to_json
 from relay_autotune.loop.analysis import analyse_loop
-from relay_autotune.loop.gains import Gains, Performance
+from relay_autotune.loop.gains import FORMS, Gains, Performance, series_form
 from relay_autotune.process.structures import (
     GENERAL,
     STRUCTURES,
@@ -52,7 +51,6 @@ from relay_autotune.result import Shaping
 from relay_autotune.text import digits
 from relay_autotune.tuning import DEFAULT_RULE, RULES, design, task_of_model
 from relay_autotune.tuning.compensators import COMPENSATORS, Compensator
-from relay_autotune.tuning.forms import FORMS, series_form
 from relay_autotune.tuning.task import DesignTask
 
 if TYPE_CHECKING:

@@ -21,11 +21,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
 
+from relay_autotune.analysis import options_from
+from relay_autotune.cli.after_tune import CONTROLLER, Proof
 from relay_autotune.cli.apply_gains import found_entries, verdict_entries
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, exit_status, say, worst
 from relay_autotune.cli.loops import Loop
 from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN
-from relay_autotune.cli.proof import CONTROLLER, Proof
 from relay_autotune.cli.report import analysed_as_there, defaults, flags_of
 from relay_autotune.cli.terminal import UNITS
 from relay_autotune.cli.tune_view import (
@@ -49,7 +50,6 @@ from relay_autotune.experiment.early_end import ULTIMATE_GAIN
 from relay_autotune.identification.result import Identification
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.gains_client import GainsClient
-from relay_autotune.nodes.identifier_parameters import options_from
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.record.record import Record

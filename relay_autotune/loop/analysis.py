@@ -38,7 +38,7 @@ from relay_autotune.loop.stability import (
     sampled_unstable_poles,
     sensitivity_peaks,
 )
-from relay_autotune.process.model_set import ModelSet
+from relay_autotune.process.response import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 
 _POINTS = 4096

@@ -13,7 +13,15 @@ from typing import Any
 
 from rclpy.task import Future
 
-from relay_autotune.analysis import RunningFit, Task, analyse, analyse_jointly, model_so_far
+from relay_autotune.analysis import (
+    PARAMETERS,
+    RunningFit,
+    Task,
+    analyse,
+    analyse_jointly,
+    model_so_far,
+    task_from,
+)
 from relay_autotune.errors import RelayAutotuneError, defect
 from relay_autotune.exchange.messages import (
     fill_gains,
@@ -28,7 +36,6 @@ from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.identification.result import Identification
 from relay_autotune.loop.gains import Gains
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.identifier_parameters import PARAMETERS, task_from
 from relay_autotune.nodes.lifetime import ServedNode, run
 from relay_autotune.nodes.parameters import ask_before_changes, declare, merged, values_of
 from relay_autotune.nodes.results import Refusals, SignsOfLife

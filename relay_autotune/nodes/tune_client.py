@@ -289,7 +289,7 @@ class TuneClient(LoopClient):
         :param patience: how long to wait for them [s].
         """
         # Imported here, because it loads slowly and must not delay a tune.
-        from relay_autotune.nodes.identifier_parameters import PARAMETERS
+        from relay_autotune.analysis import PARAMETERS
 
         names = [entry.name for entry in PARAMETERS]
         for end in self._node.get_publishers_info_by_topic(self._resolved("pi_gains")):

@@ -15,9 +15,8 @@ from markupsafe import Markup
 
 import relay_autotune
 from relay_autotune.process.transfer_function import process_mathml, process_text
-from relay_autotune.report.case import Case
-from relay_autotune.report.figures import PLATES, Plate
-from relay_autotune.report.findings import (
+from relay_autotune.report.case import (
+    Case,
     Chip,
     beside_present,
     checks_of,
@@ -29,6 +28,7 @@ from relay_autotune.report.findings import (
     verdict_of,
     warnings_of,
 )
+from relay_autotune.report.figures import PLATES, Plate
 from relay_autotune.report.style import COLOURS, inline
 from relay_autotune.text import digits, plus_minus, visible
 

@@ -30,7 +30,7 @@ from relay_autotune.loop.gains import InternalModelLaw
 from relay_autotune.loop.sampled import Limits, require_period
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
-from relay_autotune.tuning.rules.applicability import fopdt_of, named, process_of
+from relay_autotune.tuning.rules.formulas import fopdt_of, named, process_of
 from relay_autotune.tuning.task import DesignTask
 
 DEAD_TIME_LAMBDA = 2.0

@@ -17,7 +17,7 @@ from relay_autotune.identification.result import Identification
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import ControlLaw
 from relay_autotune.loop.stability import at_infinity, winding
-from relay_autotune.process.model_set import ModelSet
+from relay_autotune.process.response import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.candidates import allowed_outside
 from relay_autotune.tuning.rules import Rule

@@ -17,7 +17,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller, Performance
 from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate, SampledLaw, Slope
-from relay_autotune.process.model_set import ModelSet
+from relay_autotune.process.response import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.quantities import check, quantity

@@ -21,10 +21,9 @@ from relay_autotune.errors import TuningError
 from relay_autotune.exchange.export import Target
 from relay_autotune.loop.analysis import Loop, abscissae, inverted
 from relay_autotune.loop.gains import Controller, Gains
-from relay_autotune.process.model_set import ModelSet
+from relay_autotune.process.response import ModelSet
 from relay_autotune.quantities import Quantity, declared
-from relay_autotune.report.case import Case
-from relay_autotune.report.findings import performance_of
+from relay_autotune.report.case import Case, performance_of
 from relay_autotune.report.frequency import (
     loop_frequencies,
     shown_load,

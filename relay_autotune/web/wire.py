@@ -20,8 +20,10 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.record.record import Record
-from relay_autotune.report.case import Case, EstimatedQuantity, ModelCase
-from relay_autotune.report.findings import (
+from relay_autotune.report.case import (
+    Case,
+    EstimatedQuantity,
+    ModelCase,
     checks_of,
     facts_of,
     performance_of,

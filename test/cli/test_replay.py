@@ -411,7 +411,7 @@ UNWANTED = {
     *("scipy.signal", "scipy.stats", "scipy.integrate", "scipy.interpolate"),
     *(f"relay_autotune.bag.{name}" for name in ("csv_file", "foreign", "pairing", "writer")),
     *(f"relay_autotune.report.{name}" for name in ("case", "figures", "page", "picture")),
-    *(f"relay_autotune.{name}" for name in ("exchange.document", "experiment.experiment")),
+    *(f"relay_autotune.{name}" for name in ("exchange.models", "experiment.experiment")),
 }
 
 

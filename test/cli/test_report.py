@@ -11,7 +11,7 @@ from analysed import completed
 from report_cases import fruitless, only
 
 from relay_autotune.cli import replay, report
-from relay_autotune.exchange.document import document, to_json
+from relay_autotune.exchange.models import document, to_json
 from relay_autotune.report import figures
 
 

@@ -16,7 +16,7 @@ import pytest
 from analysed import completed as analysed
 from report_cases import only
 
-from relay_autotune.analysis import Task
+from relay_autotune.analysis import Task, known_from, options_from
 from relay_autotune.cli import tune_loop
 from relay_autotune.cli.jobs import add_analysis, jobs_of
 from relay_autotune.cli.report import defaults, flags_of, report_of_tune
@@ -34,7 +34,6 @@ from relay_autotune.cli.tune_view import (
     wants_colour,
 )
 from relay_autotune.loop.gains import Controller
-from relay_autotune.nodes.identifier_parameters import known_from, options_from
 from relay_autotune.reasons import Code
 from relay_autotune.text import duration
 from relay_autotune_msgs.action import Tune

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from relay_autotune.cli.table import table
-from relay_autotune.exchange.document import document, to_json
 from relay_autotune.exchange.messages import fill_transfer_function
+from relay_autotune.exchange.models import document, to_json
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.judgement.assessment import (
     assess,

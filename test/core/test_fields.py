@@ -17,9 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relay_autotune.errors import RelayAutotuneError, TuningError
-from relay_autotune.exchange.document import judgement_fields, judgement_of_fields
 from relay_autotune.exchange.fields import of_document, of_message, to_document, to_message
 from relay_autotune.exchange.messages import gains_from_message, identification_from_message
+from relay_autotune.exchange.models import judgement_fields, judgement_of_fields
 from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.limit_cycle.fourier import FrequencyPoint
@@ -31,9 +31,8 @@ from relay_autotune.identification.result import (
     Validation,
 )
 from relay_autotune.loop.gains import Gains, Performance
-from relay_autotune.process.model_parameters import Quadratic
 from relay_autotune.process.structures import TABLE, Structure
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.transfer_function import Quadratic, TransferFunction
 from relay_autotune.quantities import ResultField, told_fields
 from relay_autotune.record.cycles import LimitCycle
 from relay_autotune.record.record import Cycle, RelaySettings

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.gains import Controller
-from relay_autotune.tuning.forms import SeriesForm, series_form
+from relay_autotune.loop.gains import Controller, SeriesForm, series_form
 
 S = 1j * np.geomspace(1e-3, 1e3, 25)
 

@@ -13,10 +13,9 @@ from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import analyse_loop
-from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.gains import Controller, SeriesForm, series_form
 from relay_autotune.process.structures import INTEGRATOR_INVERSE, INTEGRATOR_LAG, IPDT
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.forms import SeriesForm, series_form
 from relay_autotune.tuning.rules.luyben2003 import (
     derivative,
     gain,

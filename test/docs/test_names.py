@@ -18,7 +18,7 @@ from pages import GUIDE, PAGES, ROOT, block_noted, blocks, commands, rows, spans
 from parameter_values import check_parameter_file, check_value
 
 from relay_autotune.cli import apply_gains, csv_to_bag, replay, tune_loop
-from relay_autotune.exchange.document import document
+from relay_autotune.exchange.models import document
 from relay_autotune.identification.methods import METHODS
 from relay_autotune.nodes.plant import MODES
 from relay_autotune.process.structures import STRUCTURES

@@ -15,6 +15,7 @@ import pytest
 import rclpy
 from rclpy.parameter import Parameter
 
+from relay_autotune.analysis import KNOWN, PARAMETERS, known_from
 from relay_autotune.cli.own_nodes import free_domain
 from relay_autotune.errors import ParameterError
 from relay_autotune.exchange.messages import fill_experiment
@@ -23,7 +24,6 @@ from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.nodes.identifier import IdentifierNode
-from relay_autotune.nodes.identifier_parameters import KNOWN, PARAMETERS, known_from
 from relay_autotune.nodes.lifetime import Executor
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction

@@ -16,8 +16,7 @@ import pytest
 from analysed import MODEL, completed
 from report_cases import aborted, fruitless, only
 
-from relay_autotune.exchange.document import document, to_json
-from relay_autotune.exchange.models import model_fields
+from relay_autotune.exchange.models import document, model_fields, to_json
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Combination, Rival, identified
 from relay_autotune.loop.analysis import analyse_loop
@@ -39,6 +38,7 @@ from relay_autotune.process.structures import (
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.report.case import (
     Case,
+    beside_present,
     case_of,
     cases_of_document,
     in_loop,
@@ -46,7 +46,6 @@ from relay_autotune.report.case import (
     true_value,
 )
 from relay_autotune.report.figures import PLATES
-from relay_autotune.report.findings import beside_present
 from relay_autotune.report.page import page
 from relay_autotune.report.style import COLOURS
 

@@ -25,10 +25,9 @@ from relay_autotune.identification.waveform.separable import (
     predicted_cost,
     refine,
 )
-from relay_autotune.process.model_parameters import Quadratic
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import Structure
-from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.transfer_function import Quadratic, TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Input, PiecewiseConstant
 

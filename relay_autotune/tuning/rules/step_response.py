@@ -37,12 +37,11 @@ import numpy as np
 from scipy.optimize import brentq
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.gains import Controller, SeriesForm
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant
-from relay_autotune.tuning.forms import SeriesForm
-from relay_autotune.tuning.rules.applicability import (
+from relay_autotune.tuning.rules.formulas import (
     controller,
     is_first_order,
     named,

@@ -24,14 +24,18 @@ from relay_autotune.identification.methods.lags import equal
 from relay_autotune.identification.methods.thyagarajan import HIGHER_ORDER, dead_time_ratio
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.rules.applicability import (
+from relay_autotune.tuning.rules.formulas import (
+    ITAE_RANGE,
     fopdt_of,
+    half_cycle,
+    imc,
     is_first_order,
+    itae,
     named,
     process_of,
+    tyreus_luyben,
     wants_pid,
 )
-from relay_autotune.tuning.rules.formulas import ITAE_RANGE, half_cycle, imc, itae, tyreus_luyben
 from relay_autotune.tuning.rules.luyben2003 import resonant_gain
 from relay_autotune.tuning.task import DesignTask
 
