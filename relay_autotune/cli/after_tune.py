@@ -505,16 +505,15 @@ class AfterTune:
         :return: whether the proof has passed, None: none was wanted; and what speaks against the
             gains in the end, empty: nothing.
         """
-        against = _UNFINISHED
+        passed, against = None, _UNFINISHED
         try:
-            try:
-                passed, against = self._offered()
-            except RelayAutotuneError as error:
-                say(PROGRAM, f"the gains are not proven: {error}")
-                passed, against = False, f"not proven: {error}"
-            return passed, against
+            passed, against = self._offered()
+        except RelayAutotuneError as error:
+            say(PROGRAM, f"the gains are not proven: {error}")
+            passed, against = False, f"not proven: {error}"
         finally:
             self._say_what_is_left(against)
+        return passed, against
 
     def _offered(self) -> tuple[bool | None, str]:
         options, doubt = self.options, self.doubt

@@ -185,16 +185,13 @@ def rows(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
         row = base | {"experiment": number} | {n: experiment.get(n) for n in _OF_EXPERIMENT}
         if experiment["selected"] is not None:
             model = experiment["models"][experiment["selected"]]
-            row |= {name: _cell(model[name]) for name in _OF_MODEL}
+            cells = ((name, model[name]) for name in _OF_MODEL)
+            row |= {n: json.dumps(v) if isinstance(v, list) else v for n, v in cells}
             row |= {name: model["fit"][name] for name in _OF_FIT}
         if experiment["recommended"] is not None:
             gains = experiment["gains"][experiment["recommended"]]
             row |= {name: gains[name] for name in _OF_GAINS}
         yield row
-
-
-def _cell(value: Any) -> Any:
-    return json.dumps(value) if isinstance(value, list) else value
 
 
 def _for_spreadsheets(row: dict[str, Any]) -> dict[str, Any]:

@@ -151,10 +151,16 @@ class _LoopOnPage:
                 self._client.rest(_TICK)
                 wish = self._live.next_wish()
                 if wish is None:
-                    self._look_now_and_then()
+                    if self._gains.look_now_and_then():
+                        # It shows what the next tune would take, too.
+                        self._show_form()
                 elif wish.what in (CHECK, START):
-                    if self._is_set(wish):
-                        status = self._tune() if wish.what == START else self._check(status)
+                    if not self._is_set(wish):
+                        continue
+                    if wish.what == START:
+                        status = self._tune()
+                    else:
+                        self._check()
                 else:
                     with self._commands_shown():
                         self._gains.do(wish)
@@ -192,11 +198,6 @@ class _LoopOnPage:
         )
         self._cycles.append(cycle)
 
-    def _look_now_and_then(self) -> None:
-        """Read the gains in force, and show what the next tune would take, at an interval."""
-        if self._gains.look_now_and_then():
-            self._show_form()
-
     def _show_form(self) -> None:
         """Show the settings of the next tune."""
         form = tuple(self._loop.answers.form(self._loop.form))
@@ -217,8 +218,8 @@ class _LoopOnPage:
             self._show_form()
         return True
 
-    def _check(self, status: int) -> int:
-        """Ask whether a tune could start, and how; return the exit status of the last tune."""
+    def _check(self) -> None:
+        """Ask whether a tune could start, and how."""
         self._live.tell(phase="checking", status="looking at the loop", tone="")
         result = self._client.check(self._options.amplitude)
         accepted = self._client.succeeded
@@ -231,7 +232,6 @@ class _LoopOnPage:
             accepted=accepted,
             limits=self._loop.limits(),
         )
-        return status
 
     def _tune(self) -> int:
         """Tune until the result is there."""

@@ -108,14 +108,6 @@ def _estimate_of_fields(m: dict[str, Any]) -> Estimate:
     return Estimate(structure_of(model, names), values, covariance)
 
 
-def _rival_fields(rival: Rival) -> dict[str, Any]:
-    return {"support": json_number(rival.support), **model_fields(rival.model)}
-
-
-def _rival_of_fields(r: dict[str, Any]) -> Rival:
-    return Rival(Estimate.of_model(model_of_fields(r)), number(r["support"]))
-
-
 def _estimate_to_message(message: Any, estimate: Estimate) -> None:
     model = estimate.model
     message.structure = model.structure
@@ -198,7 +190,13 @@ register(
     Estimate,
     Special(_estimate_fields, _estimate_of_fields, _estimate_to_message, _estimate_of_message),
 )
-register(Rival, Special(_rival_fields, _rival_of_fields))
+register(
+    Rival,
+    Special(
+        lambda rival: {"support": json_number(rival.support), **model_fields(rival.model)},
+        lambda r: Rival(Estimate.of_model(model_of_fields(r)), number(r["support"])),
+    ),
+)
 register(TransferFunction, Special(model_fields, model_of_fields))
 
 

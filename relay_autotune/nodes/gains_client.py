@@ -146,11 +146,8 @@ class GainsClient(LoopClient):
 
     def in_force(self) -> Controller | None:
         """Return the gains in force, also where another node has them; None: there are none."""
-        names = ("apply_to", "apply_parameters")
-        target, mapping = self.values(self.name, names).values()
+        target, places, there = self._there()
         if target:
-            places = mapping_of(mapping)
-            there = self.values(target, list(places.values()))
             return controller_of({gain: there[place] for gain, place in places.items()})
         found = self.values(self.name, [entry.name for entry in GAINS])
         return Controller(**found) if found["kc"] else None
@@ -297,7 +294,7 @@ class GainsClient(LoopClient):
         """
         before = self.values(self.name, ("verify_step", "verify_step_max"))
         more = abs(setpoint) > max(map(abs, before.values()))
-        there = self._there()
+        target, _, there = self._there()
         goal = Verify.Goal(setpoint_step=setpoint, load_step=load, patience=patience)
         if more:
             self.set_values(self.name, {"verify_step_max": abs(setpoint)})
@@ -306,18 +303,24 @@ class GainsClient(LoopClient):
         except GoneError as error:
             # Nobody is left who has it.
             more = False
-            raise GoneError(f"{error}; {self._taken_back(*there)}") from error
+            raise GoneError(f"{error}; {self._taken_back(target, there)}") from error
         finally:
             if more:
                 with suppress(LoopError):
                     self.set_values(self.name, {"verify_step_max": before["verify_step_max"]})
         return result
 
-    def _there(self) -> tuple[str, dict[str, float]]:
-        """Return the other node that has the gains, and its parameters; empty: there is none."""
+    def _there(self) -> tuple[str, dict[str, str], dict[str, float]]:
+        """Return the other node that has the gains, its parameter for each, and their values.
+
+        Empty: there is none.
+        """
         names = ("apply_to", "apply_parameters")
         target, mapping = self.values(self.name, names).values()
-        return target, self.values(target, list(mapping_of(mapping).values())) if target else {}
+        if not target:
+            return "", {}, {}
+        places = mapping_of(mapping)
+        return target, places, self.values(target, list(places.values()))
 
     def _taken_back(self, target: str, before: dict[str, float]) -> str:
         """Bring back the gains of another node, whose controller_node is gone, and say so.

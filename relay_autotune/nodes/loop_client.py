@@ -48,6 +48,22 @@ _OTHER_ENDS = (
 )
 
 
+def readable(
+    value: Callable[[Any], float], take: Callable[[float], object]
+) -> Callable[[Any], None]:
+    """Return what takes the number in each message, and passes over messages without it.
+
+    :param value: reads it.
+    :param take: called with it.
+    """
+
+    def hear(message: Any) -> None:
+        with suppress(FieldError):
+            take(value(message))
+
+    return hear
+
+
 class GoneError(LoopError):
     """A node has gone, or does not answer any more."""
 
@@ -383,9 +399,8 @@ class LoopClient:
         if not self._node.count_publishers(name):
             return math.nan
         heard: list[float] = []
-        for message in self.heard(commands.kind, name, _LISTEN):
-            with suppress(FieldError):
-                heard.append(commands.value(message))
+        with self._hearing(commands.kind, name, readable(commands.value, heard.append)):
+            self.rest(_LISTEN)
         return sum(heard) / len(heard) if heard else math.nan
 
     def measured(self, topic: str, type_name: str, field: str) -> float:
@@ -398,11 +413,7 @@ class LoopClient:
         """
         reader = reader_of(type_name, field)
         heard: list[float] = []
-
-        def hear(message: Any) -> None:
-            with suppress(FieldError):
-                heard.append(reader.value(message))
-
+        hear = readable(reader.value, heard.append)
         with self._hearing(reader.kind, self._resolved(topic), hear):
             self.wait(lambda: bool(heard), _LISTEN)
         return heard[-1] if heard else math.nan

@@ -15,7 +15,7 @@ from rclpy.action import ActionClient
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import qos_profile_sensor_data
 
-from relay_autotune.errors import FieldError, LoopError
+from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import (
     made_visible,
     reason_from_message,
@@ -24,7 +24,7 @@ from relay_autotune.exchange.messages import (
 )
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.live_types import CommandMessage, reader_of
-from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient
+from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient, readable
 from relay_autotune.reasons import Code, Reason
 from relay_autotune.record.record import Record
 from relay_autotune_msgs.action import Tune
@@ -243,13 +243,9 @@ class TuneClient(LoopClient):
         """
         values = self.values(self.name, ["measurement_type", "measurement_field"])
         reader = reader_of(*values.values())
-
-        def hear(message: Any) -> None:
-            with suppress(FieldError):
-                take(reader.value(message))
-
         name = self._topic_of(self.name, "measurement", reader.type_name, published=False)
         # Best effort, so that nobody waits for this client.
+        hear = readable(reader.value, take)
         self._node.create_subscription(reader.kind, name, hear, qos_profile_sensor_data)
 
     def command_watch(
@@ -267,11 +263,7 @@ class TuneClient(LoopClient):
         kind, field = self.values(self.name, ["command_type", "command_field"]).values()
         commands = CommandMessage(kind, field, "", taken=True, now_ns=time.time_ns)
         name = self._topic_of(self.name, "command", commands.type_name, published=True)
-        cycles = self._resolved("relay_cycle")
-
-        def hear(message: Any) -> None:
-            with suppress(FieldError):
-                take(commands.value(message))
+        cycles, hear = self._resolved("relay_cycle"), readable(commands.value, take)
 
         @contextmanager
         def heard() -> Iterator[None]:

@@ -51,19 +51,14 @@ def require_own_time(
     :raises ParameterError: if the first and one of the others are given.
     """
     if sample_period > 0.0 and command_period > 0.0:
+        other, which = "command_period", "one of them"
         why = "a plant in lockstep would take each repeated command for the answer to a sample"
-        raise ParameterError(
-            Code.TWO_CLOCKS(
-                other="command_period", period=sample_period, why=why, which="one of them"
-            )
-        )
-    if sample_period > 0.0 and repeat_period > 0.0:
+    elif sample_period > 0.0 and repeat_period > 0.0:
+        other, which = "repeat_period", "sample_period"
         why = "a sensor that is silent while nothing changes has no constant sample period"
-        raise ParameterError(
-            Code.TWO_CLOCKS(
-                other="repeat_period", period=sample_period, why=why, which="sample_period"
-            )
-        )
+    else:
+        return
+    raise ParameterError(Code.TWO_CLOCKS(other=other, period=sample_period, why=why, which=which))
 
 
 class Repeater:

@@ -26,10 +26,9 @@ from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import Part
-from relay_autotune.identification.waveform.rational import theta_of
 from relay_autotune.loop.analysis import ms_on
 from relay_autotune.process.response import response
-from relay_autotune.process.structures import UNSTABLE_FOPDT, GivenModel, structure_named
+from relay_autotune.process.structures import UNSTABLE_FOPDT, GivenModel
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Actuator, Disturbances, VirtualProcess
 from relay_autotune.record.record import PiecewiseConstant, Record
@@ -188,27 +187,6 @@ def test_a_record_that_is_mostly_another_input_is_doubtful():
 
 
 # Parts of a record, plain models, long times, and commands without effect.
-
-
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [
-        ("fopdt", (2.0, 10.0, 3.0)),
-        ("sopdt", (2.0, 10.0, 4.0, 3.0)),
-        ("sopdt_zero", (2.0, 10.0, 4.0, -1.5, 3.0)),
-        ("three_lags", (2.0, 10.0, 4.0, 1.0, 3.0)),
-        ("ipdt", (2.0, 3.0)),
-        ("integrator_lag", (2.0, 10.0, 3.0)),
-    ],
-)
-def test_theta_of_a_models_values_is_read_as_these_values(name, values):
-    structure = structure_named(name)
-    assert len(structure.names) == len(values)
-    by_name = dict(zip(structure.names, values, strict=True))
-    theta = theta_of(structure, np.array(values))
-    gain = by_name["gain"]
-    _, read = structure.read(theta, np.array((gain, gain * by_name.get("zero", 0.0))))
-    np.testing.assert_allclose(read, values, rtol=1e-12)
 
 
 def joined(first, second, *, noise=0.02):

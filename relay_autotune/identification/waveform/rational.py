@@ -15,7 +15,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.process.response import Modes, recursion
 from relay_autotune.process.structures import FOPDT, Structure
-from relay_autotune.process.transfer_function import DEAD_TIME, Denominator, Quadratic
+from relay_autotune.process.transfer_function import Denominator, Quadratic
 from relay_autotune.record.record import Input, PiecewiseConstant, PiecewiseLinear
 
 _LOG_STEP = 1.0
@@ -37,24 +37,6 @@ def columns_of(
     if structure == FOPDT and isinstance(u, PiecewiseConstant):
         return one_lag(theta, time, u)
     return responses(structure.denominator, structure.powers, theta, time, u)
-
-
-def theta_of(structure: Structure, values: FloatArray) -> FloatArray:
-    """Return the theta that stands for values of a structure's parameters, shape (m,).
-
-    :param structure: the structure.
-    :param values: of its parameters, in their order, shape (p,).
-    """
-    given = dict(zip(structure.parameters, values.tolist(), strict=True))
-    logs: list[float] = []
-    for factor in structure.factors:
-        poles = factor.poles([given[p] for p in factor.parameters])
-        if isinstance(factor, Quadratic):
-            size = math.sqrt(abs(poles[0] * poles[1]))
-            logs += [math.log(size), math.log(0.5 * (poles[0] + poles[1]).real / size)]
-        else:
-            logs.append(math.log(abs(poles[0].real)))
-    return np.array([*logs, given[DEAD_TIME]])
 
 
 def unit_steps(structure: Structure, theta: FloatArray, least: float = 0.0) -> FloatArray:
