@@ -201,7 +201,15 @@ class TextTable:
             if cells[0].startswith(_REMARKS) or (self._head and cells == self._head):
                 left_out += 1
                 continue
-            yield line, self._joined(cells)
+            cells = self._joined(cells)
+            # A separator at a line's end is no cell.
+            if any(cells[len(self.names) :]):
+                raise BagError(
+                    f"{self._path}, line {line}: {len(cells)} cells, but {len(self.names)} "
+                    f"columns have a name; a decimal comma, or a separator within a text, would "
+                    f"make such a line"
+                )
+            yield line, cells
         if left_out:
             self.notes.append(f"{left_out} lines between the rows hold remarks and are left out")
 
@@ -218,27 +226,12 @@ class TextTable:
         lines: list[int] = []
         untimed, damaged = 0, []
         for line, row in self._rows():
-            # A separator at a line's end is no cell.
-            if any(row[len(self.names) :]):
-                raise BagError(
-                    f"{self._path}, line {line}: {len(row)} cells, but {len(self.names)} columns "
-                    f"have a name; a decimal comma, or a separator within a text, would make such "
-                    f"a line"
-                )
             stamp = "" if time is None or time >= len(row) else row[time]
             if time is not None and stamp.lower() in _MISSING:
                 untimed += 1
                 continue
-            found = []
             try:
-                for k, at in enumerate(places):
-                    cell = row[at] if at < len(row) else ""
-                    number, suffix = self._number(line, at, cell)
-                    if suffixes[k] not in (None, suffix) and not math.isnan(number):
-                        raise self._no_number(line, at, cell)
-                    found.append(number)
-                    if not math.isnan(number):
-                        suffixes[k] = suffix
+                found = self._numbers(line, row, places, suffixes)
                 if time is not None:
                     self._stamp(line, time, stamp, times)
             except BagError as error:
@@ -273,6 +266,25 @@ class TextTable:
             )
         self.lines = np.array(lines, dtype=np.int64)
         return times, [np.array(column) for column in values]
+
+    def _numbers(
+        self, line: int, row: list[str], places: Sequence[int], suffixes: list[str | None]
+    ) -> list[float]:
+        """Return the numbers of a row at some places; NaN: an empty cell.
+
+        :param suffixes: the units behind the numbers of each place so far, which stay the same.
+        """
+        found = []
+        for k, at in enumerate(places):
+            cell = row[at] if at < len(row) else ""
+            number, suffix = self._number(line, at, cell)
+            found.append(number)
+            if math.isnan(number):
+                continue
+            if suffixes[k] not in (None, suffix):
+                raise self._no_number(line, at, cell)
+            suffixes[k] = suffix
+        return found
 
     def _stamp(self, line: int, at: int, cell: str, times: Times) -> None:
         date = None if _is_number(cell) else _date(cell)
