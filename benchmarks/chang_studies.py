@@ -26,8 +26,15 @@ import numpy as np
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.methods.chang import ultimate_estimate
-from relay_autotune.identification.methods.lags import equal, solutions, with_amplitude
-from relay_autotune.identification.methods.square_wave import EXACT, FIRST, MIXED, Wave
+from relay_autotune.identification.methods.lags import (
+    EXACT,
+    FIRST,
+    MIXED,
+    Wave,
+    equal,
+    solutions,
+    with_amplitude,
+)
 from relay_autotune.process.structures import SOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

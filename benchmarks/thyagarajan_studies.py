@@ -34,10 +34,9 @@ from relay_autotune.identification.limit_cycle.shape import (
     shape_of_record,
 )
 from relay_autotune.identification.methods import identify
-from relay_autotune.identification.methods.first_order import flat_fopdt, fopdt
-from relay_autotune.identification.methods.lags import equal
-from relay_autotune.identification.methods.square_wave import EXACT, FIRST
+from relay_autotune.identification.methods.lags import EXACT, FIRST, equal
 from relay_autotune.identification.methods.thyagarajan import HIGHER_ORDER, SMALL_DEAD_TIME
+from relay_autotune.identification.methods.wang import flat_fopdt, fopdt
 from relay_autotune.process.simulation import HalfCycle, RelayRun, simulate_relay
 from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction

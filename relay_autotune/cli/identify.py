@@ -26,11 +26,14 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.limit_cycle.shape import Shape
 from relay_autotune.identification.methods.chang import atv_from_numbers, chang_from_numbers
-from relay_autotune.identification.methods.first_order import fopdt_with_gain
 from relay_autotune.identification.methods.li import li_from_numbers
 from relay_autotune.identification.methods.luyben import identify_step_numbers
 from relay_autotune.identification.methods.thyagarajan import identify_numbers
-from relay_autotune.identification.methods.wang import FopdtCycle, fopdt_from_biased
+from relay_autotune.identification.methods.wang import (
+    FopdtCycle,
+    fopdt_from_biased,
+    fopdt_with_gain,
+)
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.process.structures import FOPDT
 

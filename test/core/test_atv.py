@@ -23,13 +23,13 @@ from relay_autotune.identification.methods.chang import (
     ultimate_estimate,
 )
 from relay_autotune.identification.methods.lags import (
+    FIRST,
     MODEL_4,
     MODEL_5,
     equal,
     solutions,
     with_amplitude,
 )
-from relay_autotune.identification.methods.square_wave import FIRST
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import equal_lags
 from relay_autotune.process.transfer_function import TransferFunction

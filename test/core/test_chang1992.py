@@ -20,15 +20,17 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.chang import chang_from_numbers, identify_chang
-from relay_autotune.identification.methods.lags import equal, solutions, with_amplitude
-from relay_autotune.identification.methods.square_wave import (
+from relay_autotune.identification.methods.lags import (
     EXACT,
     MIXED,
     Wave,
+    equal,
     fundamental,
     level,
     peak,
     slope_sign,
+    solutions,
+    with_amplitude,
 )
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import SOPDT, TWO_EQUAL_ONE

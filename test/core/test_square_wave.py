@@ -14,7 +14,7 @@ from sampled_relay import exact_limit_cycle
 from scipy.special import gammaincc
 
 from relay_autotune.errors import ModelError
-from relay_autotune.identification.methods.square_wave import fundamental, level, peak, peak_part
+from relay_autotune.identification.methods.lags import fundamental, level, peak, peak_part
 from relay_autotune.process.structures import TWO_EQUAL_ONE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings

@@ -18,16 +18,15 @@ from worked_cases import cases
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.limit_cycle.shape import shape_of_half_cycle
-from relay_autotune.identification.methods.first_order import (
-    flat_fopdt,
-    fopdt,
-    rise_time_constant,
-)
-from relay_autotune.identification.methods.lags import equal
-from relay_autotune.identification.methods.square_wave import EXACT, FIRST, Wave
+from relay_autotune.identification.methods.lags import EXACT, FIRST, Wave, equal
 from relay_autotune.identification.methods.thyagarajan import (
     dead_time_ratio,
     order_from_curvature,
+)
+from relay_autotune.identification.methods.wang import (
+    flat_fopdt,
+    fopdt,
+    rise_time_constant,
 )
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.structures import UNSTABLE_FOPDT

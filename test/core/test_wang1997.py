@@ -20,13 +20,11 @@ from relay_autotune.identification.limit_cycle.fourier import (
     cycle_means,
     frequency_point,
 )
-from relay_autotune.identification.methods.first_order import (
-    fopdt_from_unbiased,
-    fopdt_with_gain,
-)
 from relay_autotune.identification.methods.wang import (
     FopdtCycle,
     fopdt_from_biased,
+    fopdt_from_unbiased,
+    fopdt_with_gain,
     identify_biased,
     identify_unbiased,
 )

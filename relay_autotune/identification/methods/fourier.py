@@ -31,8 +31,7 @@ from relay_autotune.identification.limit_cycle.fourier import (
     with_noise_about,
 )
 from relay_autotune.identification.limit_cycle.limit_cycle import RelayTest, relay_test
-from relay_autotune.identification.methods.fit import Fit
-from relay_autotune.identification.methods.solved import structure_asked_for
+from relay_autotune.identification.methods.solved import Fit, structure_asked_for
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.process.structures import (
     FOPDT,

@@ -40,17 +40,17 @@ from relay_autotune.identification.methods.chang import (
     shape_misfit,
     symmetric_cycle,
 )
-from relay_autotune.identification.methods.fit import Fit
 from relay_autotune.identification.methods.lags import (
     MODEL_1,
     MODEL_4,
     MODEL_5,
     STRUCTURES,
     equal,
+    level,
     model_text,
+    peak,
 )
-from relay_autotune.identification.methods.solved import literally, structure_asked_for
-from relay_autotune.identification.methods.square_wave import level, peak
+from relay_autotune.identification.methods.solved import Fit, literally, structure_asked_for
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.process.structures import Structure, equal_lags
 from relay_autotune.quantities import NORMAL_95

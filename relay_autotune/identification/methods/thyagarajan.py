@@ -29,10 +29,9 @@ from relay_autotune.identification.limit_cycle.shape import (
     envelope,
     read_shape,
 )
-from relay_autotune.identification.methods.first_order import flat_fopdt, fopdt
-from relay_autotune.identification.methods.lags import equal
+from relay_autotune.identification.methods.lags import EXACT, FIRST, equal
 from relay_autotune.identification.methods.solved import literally, solved, structure_asked_for
-from relay_autotune.identification.methods.square_wave import EXACT, FIRST
+from relay_autotune.identification.methods.wang import flat_fopdt, fopdt
 from relay_autotune.identification.result import Identification
 from relay_autotune.process.structures import (
     FOPDT,

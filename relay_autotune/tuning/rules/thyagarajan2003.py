@@ -19,9 +19,9 @@ from scipy.optimize import brentq
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.limit_cycle.shape import Shape, shape_of_half_cycle
-from relay_autotune.identification.methods.first_order import flat_fopdt, fopdt
 from relay_autotune.identification.methods.lags import equal
 from relay_autotune.identification.methods.thyagarajan import HIGHER_ORDER, dead_time_ratio
+from relay_autotune.identification.methods.wang import flat_fopdt, fopdt
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.rules.formulas import (
