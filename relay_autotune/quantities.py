@@ -299,7 +299,7 @@ def derived(unit: str, *, after: str, column: int = 0) -> Callable[[_Getter], _G
 
 
 @cache
-def told_fields(kind: Any) -> tuple[ResultField, ...]:
+def result_fields(kind: Any) -> tuple[ResultField, ...]:
     """Return what a result declares, in the order of documents."""
     types = get_type_hints(kind)
     found = [
@@ -319,7 +319,7 @@ def told_fields(kind: Any) -> tuple[ResultField, ...]:
     return tuple(ordered)
 
 
-def check_told(values: object, error: type[RelayAutotuneError], of: str) -> None:
+def check_result(values: object, error: type[RelayAutotuneError], of: str) -> None:
     """Refuse a result with a number outside of its declared range.
 
     :param values: the result.
@@ -327,7 +327,7 @@ def check_told(values: object, error: type[RelayAutotuneError], of: str) -> None
     :param of: what the fields belong to, as in "of the gains".
     :raises RelayAutotuneError: of that kind; the message names the field, the value and the range.
     """
-    for each in told_fields(type(values)):  # type: ignore[arg-type]
+    for each in result_fields(type(values)):  # type: ignore[arg-type]
         if each.kind is float and not each.derived:
             problem = each.problem(getattr(values, each.name))
             if problem is not None:

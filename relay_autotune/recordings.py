@@ -29,7 +29,7 @@ from relay_autotune.exchange.messages import (
     stamp_nanoseconds,
     start_seconds,
 )
-from relay_autotune.quantities import told_fields
+from relay_autotune.quantities import result_fields
 from relay_autotune.record.record import (
     Cycle,
     Outcome,
@@ -103,7 +103,7 @@ _HEADER: dict[str, Any] = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
 
 def _told(kind: type) -> dict[str, Any]:
     """Return the fields that a message has of one of our types, each with its default."""
-    fields = [each for each in told_fields(kind) if each.message is not None]
+    fields = [each for each in result_fields(kind) if each.message is not None]
     absent = {each.name: math.nan if each.nan else each.kind() for each in fields}
     given = {each.name: each.default for each in fields if each.default is not MISSING}
     return absent | given

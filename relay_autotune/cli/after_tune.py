@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from relay_autotune.cli.apply_gains import beside, found_entries
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, as_typed, exit_status, say
@@ -75,12 +75,9 @@ from relay_autotune.nodes.gains_client import GainsClient
 from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.nodes.tables import FIXED, GAINS, parameters_of_law, rate_from
 from relay_autotune.reasons import Code
+from relay_autotune.record.record import Record
 from relay_autotune.text import digits, duration
 from relay_autotune.verdict import Verdict
-
-if TYPE_CHECKING:
-    from relay_autotune.record.record import Record
-
 
 CONTROLLER = "controller_node"
 # A loop may take this many settling times to come to rest, and at least a time [s].

@@ -32,7 +32,7 @@ from relay_autotune.exchange.fields import columns
 from relay_autotune.exchange.models import COLUMNS as OF_PROCESS
 from relay_autotune.identification.result import FitReport, Identification
 from relay_autotune.loop.gains import Gains
-from relay_autotune.quantities import told_fields
+from relay_autotune.quantities import result_fields
 from relay_autotune.text import cell
 
 ENDINGS = (".jsonl", ".csv", ".parquet")
@@ -49,7 +49,7 @@ COLUMNS = (*("bag", "experiment", "error"), *(*_OF_EXPERIMENT, *_OF_MODEL, *_OF_
 _TEXTS = {
     *("bag", "error", "outcome", "reason", "experiment_id", "verdict", "verdict_reason"),
     *("structure", "zeros", "time_constants"),
-    *(f.name for kind in (Identification, Gains) for f in told_fields(kind) if f.kind is str),
+    *(f.name for kind in (Identification, Gains) for f in result_fields(kind) if f.kind is str),
 }
 
 

@@ -20,7 +20,7 @@ from typing import Any
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.loop.gains import Gains
 from relay_autotune.loop.laws import LAWS, OWN_LAW, Law
-from relay_autotune.quantities import told_fields
+from relay_autotune.quantities import result_fields
 
 _DIGITS = 10
 # Gains that are for no law in particular can be exported for this one.
@@ -264,7 +264,7 @@ def _texts(found: Iterable[tuple[str, float | str | None]]) -> list[tuple[str, s
 def plain(gains: Gains) -> str:
     """Return gains as lines of `key: value`, which is YAML."""
     lines = [*_comments(gains, (), "#"), f"rule: {gains.rule}", f"form: {gains.form}"]
-    numbers = (f for f in told_fields(Gains) if f.kind is float)
+    numbers = (f for f in result_fields(Gains) if f.kind is float)
     for each in (f for f in numbers if not f.optional):
         value = getattr(gains, each.name)
         unit = f"  # {each.unit}" if each.unit else ""

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.quantities import ResultField, told_fields
+from relay_autotune.quantities import ResultField, result_fields
 from relay_autotune.text import visible
 
 # Largest relative difference, by rounding, of a number from the one that follows from others.
@@ -91,7 +91,7 @@ def to_document(value: object) -> dict[str, Any]:
         return dict(special.to_document(value))
     found: dict[str, Any] = {}
     kind: Any = type(value)
-    for each in told_fields(kind):
+    for each in result_fields(kind):
         held = getattr(value, each.name)
         name = each.document or each.name
         if each.document is None or (each.optional and held == each.default):
@@ -134,7 +134,7 @@ def of_document(kind: Any, document: Any, **given: Any) -> Any:
         return special.of_document(document)
     found = dict(given)
     seen: set[str] = set()
-    for each in told_fields(kind):
+    for each in result_fields(kind):
         if each.document is None or each.derived or each.name in given:
             continue
         name = each.document or each.name
@@ -221,7 +221,7 @@ def word(value: Any) -> str:
 
 def columns(kind: Any) -> tuple[str, ...]:
     """Return the fields of a result that are columns of tables of many bags."""
-    found = sorted((f for f in told_fields(kind) if f.column), key=lambda f: f.column)
+    found = sorted((f for f in result_fields(kind) if f.column), key=lambda f: f.column)
     return tuple(f.name for f in found)
 
 
@@ -240,7 +240,7 @@ def to_message(message: Any, value: object, prefix: str = "") -> None:
         special.to_message(message, value)
         return
     kind: Any = type(value)
-    for each in told_fields(kind):
+    for each in result_fields(kind):
         if each.message is None:
             continue
         held, name = getattr(value, each.name), each.message or prefix + each.name
@@ -265,7 +265,7 @@ def _parts(each: ResultField, prefix: str) -> tuple[tuple[str, str], ...]:
 
 
 def _write_columns(message: Any, items: Sequence[object], kind: type, prefix: str) -> None:
-    for each in told_fields(kind):
+    for each in result_fields(kind):
         held = [getattr(item, each.name) for item in items]
         for name, which in _parts(each, prefix):
             values = [getattr(value, which) for value in held] if which else held
@@ -289,7 +289,7 @@ def of_message(
     if special is not None and special.of_message is not None:
         return special.of_message(message, error, of)
     found: dict[str, Any] = {}
-    for each in told_fields(kind):
+    for each in result_fields(kind):
         if each.message is None or each.derived:
             continue
         part, many = _part_of(each.kind)
@@ -335,7 +335,7 @@ def _read_columns(
 ) -> tuple[Any, ...]:
     told: dict[str, list[Any]] = {}
     first = ""
-    for each in told_fields(kind):
+    for each in result_fields(kind):
         parts = []
         for name, _ in _parts(each, prefix):
             held, first = list(getattr(message, name)), first or name
@@ -363,7 +363,7 @@ def _check_derived(
     value: Any, message: Any, error: type[RelayAutotuneError], of: str, prefix: str
 ) -> None:
     kind: Any = type(value)
-    derived = [f for f in told_fields(kind) if f.derived]
+    derived = [f for f in result_fields(kind) if f.derived]
     said = {f.name: float(getattr(message, prefix + f.name)) for f in derived}
     # A message that is written by hand may leave out the derived numbers.
     for name in said if any(said.values()) else ():

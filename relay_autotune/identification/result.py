@@ -16,7 +16,7 @@ from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.limit_cycle.fourier import FrequencyPoint
 from relay_autotune.process.transfer_function import TransferFunction, process_text
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.quantities import NORMAL_95, result_field, told_fields
+from relay_autotune.quantities import NORMAL_95, result_field, result_fields
 
 # Largest half interval of a determined value, relative to the value.
 DETERMINED = 0.2
@@ -90,7 +90,9 @@ class Validation:
         """Return the largest of them; infinite where the model has no limit cycle."""
         if self.reason:
             return math.inf
-        return max(abs(getattr(self, f.name)) for f in told_fields(Validation) if f.kind is float)
+        return max(
+            abs(getattr(self, f.name)) for f in result_fields(Validation) if f.kind is float
+        )
 
 
 @dataclass(frozen=True)

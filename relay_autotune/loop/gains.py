@@ -27,7 +27,7 @@ import numpy as np
 from relay_autotune.arrays import ComplexArray
 from relay_autotune.errors import TuningError
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.quantities import check_told, derived, result_field
+from relay_autotune.quantities import check_result, derived, result_field
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class Performance(StepFigures, Margins):
     measurement; without a sampling period the largest gain at any frequency."""
 
     def __post_init__(self) -> None:
-        check_told(self, TuningError, "of the gains")
+        check_result(self, TuningError, "of the gains")
 
 
 @dataclass(frozen=True, kw_only=True)

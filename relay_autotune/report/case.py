@@ -533,10 +533,11 @@ def beside_present(case: Case) -> tuple[Row, ...]:
     new, present = case.best_gains, case.present
     if case.model is None or new is None or present is None:
         return ()
-    old = told_of(present, performance_of(present, case))
+    old = compared_numbers(present, performance_of(present, case))
+    then = compared_numbers(new, new)
     return tuple(
         Row(name, value, other, meaning)
-        for (name, value, meaning), (_, other, _) in zip(old, told_of(new, new), strict=False)
+        for (name, value, meaning), (_, other, _) in zip(old, then, strict=False)
     )
 
 
@@ -554,7 +555,7 @@ def performance_of(present: Controller, case: Case) -> Performance | None:
         return None
 
 
-def told_of(gains: Controller, does: Performance | None) -> list[tuple[str, str, str]]:
+def compared_numbers(gains: Controller, does: Performance | None) -> list[tuple[str, str, str]]:
     """Return the names, values and meanings by which gains are compared.
 
     :param gains: the gains.

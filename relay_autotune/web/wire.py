@@ -25,9 +25,9 @@ from relay_autotune.report.case import (
     EstimatedQuantity,
     ModelCase,
     checks_of,
+    compared_numbers,
     facts_of,
     performance_of,
-    told_of,
     verdict_of,
     warnings_of,
 )
@@ -146,7 +146,7 @@ def of_present(subject: PageModel) -> dict[str, Any]:
     case, before = subject.case, subject.before()
     if case.present is None or case.model is None:
         return {"rows": [], "steps": None}
-    rows = told_of(case.present, performance_of(case.present, case))
+    rows = compared_numbers(case.present, performance_of(case.present, case))
     steps = None
     if before is not None:
         steps = [short(each) for each in (before.time, before.measurement, before.command)]
@@ -190,7 +190,7 @@ def of_shaped(subject: PageModel, shaped: DesignResult) -> dict[str, Any]:
         "isa": [[n, digits(v), unit, meaning] for n, v, unit, meaning in isa],
         "parallel": [[n, digits(v), unit] for n, v, unit in parallel],
         "effects": _effects(shaped),
-        "beside": [value for _, value, _ in told_of(gains, gains)],
+        "beside": [value for _, value, _ in compared_numbers(gains, gains)],
         "at": short(np.array([gains.ms, gains.iae_load])),
         "b": gains.b,
         "ms": gains.ms,

@@ -30,7 +30,7 @@ from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.quantities import told_fields
+from relay_autotune.quantities import result_fields
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 from relay_autotune.result import Analysis
 
@@ -98,7 +98,7 @@ def test_json_table_and_message_carry_all_of_it(record, models):
     analysis = Analysis(record, models=tuple(models), selected=0)
     shown = json.loads(to_json(document("x", [analysis])))["experiments"][0]["models"]
     for model, fields in zip(models, shown, strict=True):
-        for name in (f.name for f in told_fields(Validation)):
+        for name in (f.name for f in result_fields(Validation)):
             assert fields["validation"][name] == getattr(model.validation, name)
         assert fields["fit"]["noise_to_signal_power"] == model.fit.noise_to_signal_power
         assert [p["frequency"] for p in fields["points"]] == [p.frequency for p in model.points]

@@ -33,7 +33,7 @@ from relay_autotune.identification.result import (
 from relay_autotune.loop.gains import Gains, Performance
 from relay_autotune.process.structures import TABLE, Structure
 from relay_autotune.process.transfer_function import Quadratic, TransferFunction
-from relay_autotune.quantities import ResultField, told_fields
+from relay_autotune.quantities import ResultField, result_fields
 from relay_autotune.record.cycles import LimitCycle
 from relay_autotune.record.record import Cycle, RelaySettings
 from relay_autotune.verdict import Finding, Judgement, Result
@@ -105,7 +105,7 @@ def results(draw: Any, kind: Any) -> Any:
             draw(POSITIVE), draw(POSITIVE), 1.5, 1.2, draw(st.floats(1.5, math.inf))
         )
     found: dict[str, Any] = {}
-    for each in (f for f in told_fields(kind) if not f.derived):
+    for each in (f for f in result_fields(kind) if not f.derived):
         inner = [a for a in get_args(each.kind) if a not in (type(None), ...)]
         if get_origin(each.kind) is np.ndarray:
             size = found["estimate"].values.size
@@ -161,7 +161,7 @@ def assert_same(back: Any, value: Any, close: bool = False) -> None:
         for one, other in zip(back, value, strict=True):
             assert_same(one, other, close)
     elif hasattr(value, "__dataclass_fields__"):
-        for each in told_fields(type(value)):
+        for each in result_fields(type(value)):
             assert_same(getattr(back, each.name), getattr(value, each.name), close)
     else:
         assert back == value or (value != value and back != back)
@@ -169,11 +169,11 @@ def assert_same(back: Any, value: Any, close: bool = False) -> None:
 
 @pytest.mark.parametrize("kind", RESULTS)
 def test_every_field_of_a_result_is_declared(kind):
-    declared = {each.name for each in told_fields(kind)}
+    declared = {each.name for each in result_fields(kind)}
     assert {f.name for f in fields(kind) if (kind, f.name) not in UNTOLD} <= declared
     said = {name for base in kind.__mro__[:-1] for name in attribute_docs(base)}
     # A property has a docstring of its own.
-    assert {each.name for each in told_fields(kind) if not each.derived} <= said
+    assert {each.name for each in result_fields(kind) if not each.derived} <= said
 
 
 @pytest.mark.long
@@ -203,7 +203,7 @@ def test_an_identification_comes_back_from_its_message(value):
     message = SimpleNamespace()
     to_message(message, value)
     back = identification_from_message(message)
-    for each in (f for f in told_fields(Identification) if f.message is not None):
+    for each in (f for f in result_fields(Identification) if f.message is not None):
         assert_same(getattr(back, each.name), getattr(value, each.name), close=True)
 
 
@@ -213,7 +213,7 @@ def test_gains_come_back_from_their_message(value):
     message = SimpleNamespace()
     to_message(message, value)
     back = gains_from_message(message)
-    for each in (f for f in told_fields(Gains) if f.message is not None):
+    for each in (f for f in result_fields(Gains) if f.message is not None):
         assert_same(getattr(back, each.name), getattr(value, each.name))
 
 
@@ -241,7 +241,7 @@ def test_a_judgement_comes_back(findings, refused, judged):
 
 
 def value_of(kind):
-    numbers = {f.name: 1.0 for f in told_fields(kind) if f.kind is float and not f.derived}
+    numbers = {f.name: 1.0 for f in result_fields(kind) if f.kind is float and not f.derived}
     if kind is Gains:
         return Gains(**numbers, rule="robust", reason="")
     if kind is Identification:
@@ -275,7 +275,7 @@ def test_a_message_has_the_fields_that_results_declare_and_no_others(name, parts
     assert told - set(vars(message)) <= beside
 
 
-@pytest.mark.parametrize("each", [f for f in told_fields(Gains) if f.derived])
+@pytest.mark.parametrize("each", [f for f in result_fields(Gains) if f.derived])
 def test_a_number_that_follows_from_others_may_not_contradict_them(each):
     gains = value_of(Gains)
     message = SimpleNamespace()
