@@ -3,7 +3,7 @@
 
 """Write tables and texts from the code into the pages of docs/; a test compares the two.
 
-    . ./env.sh && python3 tools/fill_docs.py
+    . ./env.sh && python3 -m tools.fill_docs
 
 A page asks for it with a pair of comments, and what is between them is replaced:
 
@@ -19,9 +19,6 @@ relay_autotune_msgs/msg/Reason.msg, in which every reason has its constant.
 
 from __future__ import annotations
 
-import ast
-import inspect
-import itertools
 import math
 import re
 import sys
@@ -38,6 +35,7 @@ from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS, FIXED_PARAMETERS,
 from relay_autotune.quantities import Quantity
 from relay_autotune.reasons import Code
 from relay_autotune.verdict import Check
+from tools.attribute_docs import attribute_docs
 
 ROOT = Path(__file__).resolve().parent.parent
 PARAMETER_FILE = ROOT / "config/parameters.yaml"
@@ -151,23 +149,6 @@ def laws_table(what: str) -> str:
         cells = (f"`{law.name}`", *(cell(law) for cell in chosen.values()))
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
-
-
-def attribute_docs(kind: type) -> dict[str, str]:
-    """Return the docstrings of a class's attributes, by their names.
-
-    :param kind: the class.
-    """
-    (found,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
-    assert isinstance(found, ast.ClassDef)
-    docs = {}
-    for attribute, after in itertools.pairwise(found.body):
-        if isinstance(attribute, ast.Assign | ast.AnnAssign) and isinstance(after, ast.Expr):
-            target = (
-                attribute.targets[0] if isinstance(attribute, ast.Assign) else attribute.target
-            )
-            docs[ast.unparse(target)] = " ".join(str(ast.literal_eval(after.value)).split())
-    return docs
 
 
 def reasons_table(first: int) -> str:

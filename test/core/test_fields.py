@@ -37,7 +37,7 @@ from relay_autotune.quantities import ResultField, result_fields
 from relay_autotune.record.cycles import LimitCycle
 from relay_autotune.record.record import Cycle, RelaySettings
 from relay_autotune.verdict import Finding, Judgement, Result
-from tools.fill_docs import attribute_docs
+from tools.attribute_docs import attribute_docs
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = (

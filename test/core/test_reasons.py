@@ -11,7 +11,7 @@ import pytest
 from relay_autotune.errors import NotReadyError, RecordError
 from relay_autotune.exchange.messages import fill_reason, reason_from_message
 from relay_autotune.reasons import NONE, Code, Reason, joined, may_pass, other, reason_of
-from tools.fill_docs import attribute_docs
+from tools.attribute_docs import attribute_docs
 
 MEANINGS = attribute_docs(Code)
 WORDS = re.compile(r"{(\w+)(?::([^}]*))?}")

@@ -65,11 +65,11 @@ WORDS = frozenset(re.findall(r"\w+", CODE))
 
 @pytest.mark.parametrize("page", GUIDE, ids=lambda p: str(p.relative_to(ROOT)))
 def test_what_the_code_says_is_written_in_the_page(page: Path) -> None:
-    assert page.read_text() == filled(page.read_text()), "run `python3 tools/fill_docs.py`"
+    assert page.read_text() == filled(page.read_text()), "run `python3 -m tools.fill_docs`"
 
 
 def test_the_constants_of_the_message_are_the_table():
-    assert REASON_FILE.read_text() == reason_file(), "run `python3 tools/fill_docs.py`"
+    assert REASON_FILE.read_text() == reason_file(), "run `python3 -m tools.fill_docs`"
 
 
 def test_every_node_has_its_table() -> None:

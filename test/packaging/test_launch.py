@@ -175,7 +175,7 @@ def test_a_parameter_file_gives_what_the_nodes_take(file: Path) -> None:
 
 
 def test_the_file_of_all_parameters_holds_the_defaults() -> None:
-    assert PARAMETER_FILE.read_text() == parameter_file(), "run `python3 tools/fill_docs.py`"
+    assert PARAMETER_FILE.read_text() == parameter_file(), "run `python3 -m tools.fill_docs`"
 
 
 # Layouts.
