@@ -62,3 +62,11 @@ def test_motion_is_seen_only_where_a_rest_stands_still(noise, seen):
     record = servo_record(0.15, noise)
     found = motions_of(record.time, record.measurement, record.drive())
     assert bool(found) is seen
+
+
+def test_samples_may_share_a_stamp():
+    record = servo_record(0.15)
+    coarse = np.round(record.time / (2.0 * PERIOD)) * 2.0 * PERIOD
+    (direction, _) = motions_of(coarse, record.measurement, record.drive())
+    assert np.all(np.diff(direction.times) > 0.0)
+    assert set(direction.values) == {-1.0, 0.0, 1.0}

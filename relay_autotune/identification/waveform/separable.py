@@ -319,7 +319,9 @@ def motions_of(time: FloatArray, y: FloatArray, u: Input) -> tuple[PiecewiseCons
     if np.ptp(np.cumsum(rest)) > _A_STEP * sizes.min():
         return ()
     held = np.where(steps == 0.0, u(time[:-1]) - u.initial, 0.0)
-    return tuple(PiecewiseConstant(time[:-1], x, 0.0) for x in (np.sign(steps), held))
+    # Of samples with one stamp, as a slow clock gives them, the last one counts.
+    last = np.diff(time) > 0.0
+    return tuple(PiecewiseConstant(time[:-1][last], x[last], 0.0) for x in (np.sign(steps), held))
 
 
 @dataclass(frozen=True)
