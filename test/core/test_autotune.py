@@ -100,6 +100,7 @@ def test_alone_they_are_what_they_are_beside_others(method, rule):
     assert alone.added_delay == beside.added_delay
 
 
+@pytest.mark.long
 def test_who_waits_for_the_gains_gets_the_same_ones():
     beside = _analysed("waveform", "robust")
     first = analyse(_record(), alone=True)

@@ -26,6 +26,7 @@ _VALUES = np.array([1.0, 2.0, 2.0])
 _FOUND = identified("waveform", Estimate.of(FOPDT, _VALUES, np.diag((0.01 * _VALUES) ** 2)))
 
 
+@pytest.mark.long
 def test_draws_of_one_structure_give_its_own_deviation():
     own = list(_FOUND.estimate.draws(4000, np.random.default_rng(1)))
     stds = point_stds(_FOUND, own)

@@ -243,6 +243,7 @@ def test_a_process_that_changed_is_drawn_as_each_half_shows_it():
     assert not any("two halves of the record" in text for text in same.warnings)
 
 
+@pytest.mark.long
 def test_gains_that_do_not_hold_on_one_half_are_doubtful(record, gains):
     found = identified(record)
     other = TransferFunction.fopdt(20.0, 10.0, 3.0)

@@ -38,6 +38,7 @@ def first() -> Analysis:
     return part(1.65, 1)
 
 
+@pytest.mark.long
 def test_parts_that_agree_stay_as_they_are(first):
     both = (first, part(1.65, 2))
     assert agreed(both) == both
@@ -45,6 +46,7 @@ def test_parts_that_agree_stay_as_they_are(first):
     assert agreed(()) == ()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gain", [2.5, -1.65])
 def test_of_parts_that_contradict_each_other_none_is_trusted(first, gain):
     other = part(gain, 2)
@@ -55,6 +57,7 @@ def test_of_parts_that_contradict_each_other_none_is_trusted(first, gain):
     assert "in part 1 and" in found[0].judgement.reason
 
 
+@pytest.mark.long
 def test_a_part_without_gains_contradicts_none(first):
     refused = replace(part(-1.65, 2), gains=(), recommended=None)
     assert agreed((first, refused)) == (first, refused)

@@ -253,6 +253,7 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
         noisy.require(-0.02)
 
 
+@pytest.mark.long
 # The largest deviation by a load takes up noise, which makes its comparison looser.
 @pytest.mark.parametrize(("step", "less"), [(Step(setpoint=1.0), 0.2), (Step(load=1.0), 0.06)])
 def test_the_least_step_is_where_the_noise_begins_to_decide(step, less):

@@ -78,7 +78,7 @@ def test_a_model_without_limit_cycle_is_said_in_words_and_a_start_away_from_rest
     check = next(check for check in MODEL_CHECKS if check.name == "limit_cycle")
 
     def said(validation: Validation, *warnings: str) -> str:
-        found = SimpleNamespace(validation=validation, warnings=warnings)
+        found = SimpleNamespace(validation=validation, warnings=warnings, friction=0.0)
         return check(SimpleNamespace(found=found, settled=True)).sentence
 
     none = Validation(reason="the measurement never reaches 6: there is no limit cycle")

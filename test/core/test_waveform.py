@@ -339,6 +339,7 @@ def test_neither_noise_nor_drift_counts_as_a_first_response(dead_time, tau, drif
     assert latest_dead_time(time, y, step, 1) >= 2.0 * dead_time
 
 
+@pytest.mark.long
 def test_a_dead_time_that_hides_the_first_response_is_no_explanation():
     """Steps of one length, unequal in their effect, look like each other one step later."""
     time = np.arange(0.0, 4900.0, 4.0)
