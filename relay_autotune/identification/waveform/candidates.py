@@ -29,6 +29,7 @@ from relay_autotune.identification.waveform.separable import (
     information_criterion,
     left_beside,
     left_of,
+    pulse,
     refine,
 )
 from relay_autotune.identification.waveform.starts import (
@@ -230,8 +231,9 @@ class FitContext:
         if min(problem.effects(state.coefficients)) < 0.0:
             # Commands may lose their effect on one side, but not act the other way there.
             return None
-        u = problem.inputs[0]
-        if problem.friction and isinstance(u, PiecewiseConstant):
+        if problem.friction:
+            u = problem.inputs[0]
+            assert isinstance(u, PiecewiseConstant)
             least = _LEAST_FRICTION * float(np.ptp(u.values))
             if problem.dry_friction(state.coefficients) < least:
                 return None
@@ -446,11 +448,11 @@ def with_load(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
     known = evaluate(few, state.theta)
     basis, _ = np.linalg.qr(np.concatenate((known.columns, known.derivative)).T)
     left = known.residual - basis @ (basis.T @ known.residual)
-    own, time = len(problem.structure.powers), problem.time
+    time = problem.time
     begin = float(problem.inputs[0].times[0])
     instants = np.linspace(max(begin, float(time[0])), float(time[-1]), _INSTANTS + 2)[1:-1]
-    step = PiecewiseConstant(np.zeros(1), np.ones(1), 0.0)
-    answers = few.seen(shifted_columns(few, state.theta, few.time - instants[:, None], step))
+    moved = few.time - instants[:, None]
+    answers = few.seen(shifted_columns(few.structure, state.theta, moved, pulse()))
     answers = answers - (answers @ basis) @ basis.T
     remaining = [float(np.sum(left_of(left, rows) ** 2)) for rows in answers.swapaxes(0, 1)]
     load = float(instants[int(np.argmin(remaining))])
@@ -459,8 +461,8 @@ def with_load(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
         loaded = replace(problem, load=load)
         found = refine(loaded, theta, tolerance=TRIAL, most=STEPS)
         theta = found.theta
-        step, pulse = found.coefficients[[-2 * own - 1 - problem.drift, -own - 1 - problem.drift]]
-        shift = -float(pulse / step) * problem.shortest if step else 0.0
+        step, shifts = found.coefficients[loaded.places("load")]
+        shift = -float(shifts / step) * problem.shortest if step else 0.0
         farthest = float(instants[1] - instants[0])
         if abs(shift) < problem.shortest:
             break

@@ -285,8 +285,7 @@ def _warnings(
             "motion, and a rest may stay off the set-point by what that command cannot move"
         )
     if fit.problem.load is not None:
-        own = len(fit.problem.structure.powers)
-        size = fit.state.coefficients[-2 * own - 1 - fit.problem.drift] / fit.state.coefficients[0]
+        size = fit.problem.relative("load", fit.state.coefficients)
         found.append(
             f"a load step of {size:.3g} u at {fit.problem.load:.4g} s was estimated with the "
             "model, since no model fits the record as well without one"

@@ -124,17 +124,41 @@ class Problem:
             for u, part in zip(self.inputs, self.experiments, strict=True)
         )
 
+    @property
+    def _further(self) -> tuple[str, ...]:
+        """What has responses of its own after the model's, a name for each, in their order."""
+        counts = {
+            "friction": 2 * self.friction,
+            "past": int(self.past),
+            "unequal": int(self.unequal),
+            "load": 2 * (self.load is not None),
+        }
+        return tuple(name for name, count in counts.items() for _ in range(count))
+
+    def places(self, term: str) -> list[int]:
+        """Return where each input of a term has its first coefficient, from the end of all.
+
+        :param term: ``friction``, ``past``, ``unequal`` or ``load``; of several experiments the
+            last one has these places.
+        """
+        count, lines = len(self.structure.powers), len(self.bounds) * (1 + self.drift)
+        names = self._further
+        return [-lines - (len(names) - k) * count for k, n in enumerate(names) if n == term]
+
+    def relative(self, term: str, coefficients: FloatArray) -> float:
+        """Return the size of what is estimated as an input of its own, per that of the command.
+
+        :param term: as of `places`, one that is estimated.
+        :param coefficients: of a fit, shape (k,).
+        """
+        return float(coefficients[self.places(term)[0]] / coefficients[0])
+
     def effects(self, coefficients: FloatArray) -> tuple[float, float]:
         """Return how strongly commands above and below the first one act, relative to the model.
 
         :param coefficients: of a fit, shape (k,).
         """
-        if not self.unequal:
-            return 1.0, 1.0
-        count = len(self.structure.powers)
-        after = 2 * count * (self.load is not None) + 1 + self.drift
-        at = coefficients.size - len(self.bounds) * after - count
-        share = float(coefficients[at] / coefficients[0])
+        share = self.relative("unequal", coefficients) if self.unequal else 0.0
         return 1.0 + share, 1.0 - share
 
     def dry_friction(self, coefficients: FloatArray) -> float:
@@ -142,11 +166,7 @@ class Problem:
 
         :param coefficients: of a fit, shape (k,).
         """
-        if not self.friction:
-            return 0.0
-        count = len(self.structure.powers)
-        after = count * (2 + self.past + self.unequal + 2 * (self.load is not None))
-        return -float(coefficients[-after - 1 - self.drift] / coefficients[0])
+        return -self.relative("friction", coefficients) if self.friction else 0.0
 
     @property
     def experiments(self) -> list[slice]:
@@ -207,11 +227,11 @@ class Problem:
         further = []
         if self.past:
             # The level before is that of a step at the first sample, with the same response.
-            further.append(_pulse(float(time[0]), math.inf))
+            further.append(pulse(float(time[0])))
         if self.unequal:
             further.append(_folded(u))
         if self.load is not None:
-            further += [_pulse(self.load, length) for length in (math.inf, self.shortest)]
+            further += [pulse(self.load, length) for length in (math.inf, self.shortest)]
         blocks += [columns_of(self.structure, theta, time, step) for step in further]
         rest = np.ones((1 + self.drift, time.size))
         if self.drift:
@@ -267,8 +287,12 @@ class Problem:
         return self.part(chosen)
 
 
-def _pulse(begin: float, length: float) -> PiecewiseConstant:
-    """Return a unit step, or a pulse that ends after a while."""
+def pulse(begin: float = 0.0, length: float = math.inf) -> PiecewiseConstant:
+    """Return a unit step, or a pulse that ends after a while.
+
+    :param begin: s.
+    :param length: s.
+    """
     if math.isinf(length):
         return PiecewiseConstant(np.array([begin]), np.ones(1), 0.0)
     return PiecewiseConstant(np.array([begin, begin + length]), np.array([1.0, 0.0]), 0.0)

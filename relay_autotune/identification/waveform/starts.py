@@ -23,6 +23,7 @@ from relay_autotune.identification.waveform.separable import (
     Trial,
     evaluate,
     predicted_cost,
+    pulse,
     refine,
 )
 from relay_autotune.process.response import response
@@ -73,9 +74,8 @@ def is_unobservable(
         return True
     if not (model.is_stable or model.integrators) or all(zero.real >= 0.0 for zero in model.zeros):
         return False
-    step = PiecewiseConstant(np.zeros(1), np.ones(1), 0.0)
     return (
-        float(response(model, np.array([min(pushed, length)]), step)[0]) * model.process_sign
+        float(response(model, np.array([min(pushed, length)]), pulse())[0]) * model.process_sign
         <= 0.0
     )
 
@@ -313,11 +313,10 @@ def _costs(
     for part, u in zip(problem.experiments, problem.inputs, strict=True):
         # A dead time only shifts the response: one pass over shifted samples gives all rows.
         moved = problem.time[part] - dead_times[:, None]
-        table = _table(problem, theta, moved, u)
+        table = _table(problem.structure, theta, moved, u)
         y = np.tile(problem.y[part] - problem.y[part].mean(), (dead_times.size, 1))
         if problem.past:
-            step = PiecewiseConstant(problem.time[part][:1], np.ones(1), 0.0)
-            before = _table(problem, theta, moved, step)
+            before = _table(problem.structure, theta, moved, pulse(float(problem.time[part][0])))
             own = np.einsum("dn,dn->d", before, before)
             own[own == 0.0] = 1.0
             before /= np.sqrt(own)[:, None]
@@ -331,25 +330,25 @@ def _costs(
     return np.asarray(total - np.where(refused, 0.0, along**2 / power))
 
 
-def _table(problem: Problem, theta: FloatArray, moved: FloatArray, u: Input) -> FloatArray:
+def _table(structure: Structure, theta: FloatArray, moved: FloatArray, u: Input) -> FloatArray:
     """Return a lag's responses at moved times about their means, one row for each dead time."""
-    table = shifted_columns(problem, theta, moved, u)[0]
+    table = shifted_columns(structure, theta, moved, u)[0]
     return np.asarray(table - table.mean(axis=1, keepdims=True))
 
 
 def shifted_columns(
-    problem: Problem, theta: FloatArray, moved: FloatArray, u: Input
+    structure: Structure, theta: FloatArray, moved: FloatArray, u: Input
 ) -> FloatArray:
     """Return a structure's responses at shifted times, in one pass over all of them.
 
-    :param problem: for its structure.
+    :param structure: the structure.
     :param theta: shape (m,).
     :param moved: sample times less each shift [s], shape (rows, n).
     :param u: the input.
     :return: shape (k, rows, n).
     """
     order = np.argsort(moved, axis=None, kind="stable")
-    columns, _ = columns_of(problem.structure, theta, moved.ravel()[order], u)
+    columns, _ = columns_of(structure, theta, moved.ravel()[order], u)
     found = np.empty_like(columns)
     found[:, order] = columns
     return found.reshape(-1, *moved.shape)
