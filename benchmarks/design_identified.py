@@ -32,7 +32,8 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 from relay_autotune.tuning.ensemble import ensemble
 from relay_autotune.tuning.frontier import Bounds
-from relay_autotune.tuning.search import Search, robust
+from relay_autotune.tuning.robust import robust
+from relay_autotune.tuning.search import Search
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 RATIO = 0.1

@@ -18,7 +18,8 @@ import numpy as np
 from relay_autotune.process.structures import INTEGRATOR_INVERSE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.frontier import Bounds
-from relay_autotune.tuning.search import Search, robust
+from relay_autotune.tuning.robust import robust
+from relay_autotune.tuning.search import Search
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 T = TransferFunction

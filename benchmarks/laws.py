@@ -35,7 +35,7 @@ from relay_autotune.loop.laws import LAWS, Law, SampledLaw
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Plant
-from relay_autotune.tuning.search import robust
+from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 # Samples in an ultimate period.

@@ -4,7 +4,6 @@
 """The content of a report about one experiment, from samples or from a document.
 
 The documents that `replay --json` prints hold no samples.
-Then its words: the verdict, its checks, the numbers, and what remains uncertain.
 """
 
 from __future__ import annotations
@@ -14,28 +13,27 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from relay_autotune.bag.source import open_regular
-from relay_autotune.errors import BagError, RelayAutotuneError, TuningError
+from relay_autotune.errors import BagError, RelayAutotuneError
 from relay_autotune.exchange.fields import number, of_document
 from relay_autotune.exchange.models import judgement_of_fields, model_of_fields
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.limit_cycle.fourier import FrequencyPoint
 from relay_autotune.identification.result import Identification
-from relay_autotune.loop.analysis import analyse_loop
-from relay_autotune.loop.gains import Controller, Gains, Performance
+from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import LimitCycle, cycles_of, limit_cycle, settings_of
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 from relay_autotune.result import Analysis
-from relay_autotune.text import date_text, digits, visible
+from relay_autotune.text import visible
 from relay_autotune.tuning.ensemble import ensemble
-from relay_autotune.verdict import NOT_JUDGED, Finding, Judgement, Result, Verdict
+from relay_autotune.verdict import NOT_JUDGED, Judgement
 
 
 @dataclass(frozen=True)
@@ -383,316 +381,3 @@ def _limit_cycle(c: dict[str, Any]) -> LimitCycle:
         raise ValueError(f"{c['cycles']} cycles")
     found: LimitCycle = of_document(LimitCycle, c, cycles=tuple(range(int(c["cycles"]))))
     return found
-
-
-Tone = Literal["good", "warn", "bad"]
-
-_MARKS: dict[Tone, str] = {"good": "\N{CHECK MARK}", "warn": "!", "bad": "\N{MULTIPLICATION X}"}
-_OUTCOMES = {
-    Outcome.UNKNOWN: "recorded elsewhere",
-    Outcome.COMPLETED: "completed",
-    Outcome.ABORTED: "aborted",
-    Outcome.FAILED: "failed",
-}
-_TONES: dict[Result, Tone] = {
-    Result.PASSED: "good", Result.DOUBTFUL: "warn", Result.FAILED: "bad",
-}  # fmt: skip
-_VERDICTS: dict[Verdict, tuple[str, Tone]] = {
-    Verdict.TRUSTED: ("gains ready to use", "good"),
-    Verdict.DOUBTFUL: ("doubtful gains: read first what to look at", "warn"),
-    Verdict.NONE: ("model, but no gains", "bad"),
-    Verdict.UNKNOWN: ("not judged", "warn"),
-}
-
-
-@dataclass(frozen=True)
-class Chip:
-    """The outcome of an experiment in a few words.
-
-    :param text: for people.
-    :param tone: how good it is.
-    """
-
-    text: str
-    tone: Tone
-
-
-@dataclass(frozen=True)
-class Reason:
-    """One reason to trust a result or not to.
-
-    :param name: what was looked at.
-    :param value: what was found.
-    :param meaning: what that means.
-    :param tone: how good it is.
-    """
-
-    name: str
-    value: str
-    meaning: str
-    tone: Tone
-
-    @property
-    def mark(self) -> str:
-        """A sign that shows the tone without colour."""
-        return _MARKS[self.tone]
-
-
-@dataclass(frozen=True)
-class NamedNumber:
-    """A number of the experiment with its name.
-
-    :param name: what it is.
-    :param text: the number with its unit.
-    """
-
-    name: str
-    text: str
-
-
-@dataclass(frozen=True)
-class Row:
-    """A number of the present gains beside that of the new ones.
-
-    :param name: what it is, with its unit.
-    :param present: of the present gains, as text.
-    :param new: of the new gains.
-    :param meaning: what to make of it.
-    """
-
-    name: str
-    present: str
-    new: str
-    meaning: str
-
-
-def verdict_of(case: Case) -> Chip:
-    """Return the verdict on an experiment.
-
-    :param case: the experiment.
-    """
-    if case.model is None:
-        return Chip("nothing identified", "bad")
-    return Chip(*_VERDICTS[case.judgement.verdict])
-
-
-def facts_of(case: Case, *, with_id: bool) -> tuple[str, ...]:
-    """Return where and when the experiment was recorded, and how it ended.
-
-    :param case: the experiment.
-    :param with_id: False if the page names its id elsewhere.
-    """
-    found = [_OUTCOMES[case.outcome]]
-    if with_id and case.experiment_id:
-        found.append(case.experiment_id)
-    if case.start:
-        found.append(date_text(case.start))
-    length = f"{digits(case.duration)} s"
-    if case.samples:
-        length += f", {case.samples} samples"
-        if case.lost_samples:
-            length += f", {case.lost_samples} lost"
-    return (*found, length)
-
-
-def steps_of(case: Case) -> tuple[str, ...]:
-    """Return what the reader is to do, in order.
-
-    :param case: the experiment.
-    """
-    gains = case.best_gains
-    if gains is None:
-        return (case.reason or "No gains were given, and no reason was recorded.",)
-    watch = "Make a small step of the set-point"
-    if math.isfinite(gains.overshoot) and math.isfinite(gains.settling_time):
-        watch += (
-            f": the measurement should overshoot by about {digits(100.0 * gains.overshoot, 2)} % "
-            f"and settle within {digits(gains.settling_time, 2)} s"
-        )
-        if gains.bare is not None:
-            watch += (
-                f" (p, i and d alone: {digits(100.0 * gains.bare.overshoot, 2)} % and "
-                f"{digits(gains.bare.settling_time, 2)} s)"
-            )
-    steps = (
-        "Write down the gains that the controller has now.",
-        "Type in the new gains, in the form that your controller has.",
-        f"{watch}.",
-        "If the loop swings, go back to the gains that you wrote down.",
-    )
-    if case.judgement.verdict is Verdict.DOUBTFUL:
-        return ('Check the points under "Read this first" before you use these gains.', *steps)
-    return steps
-
-
-def beside_present(case: Case) -> tuple[Row, ...]:
-    """Return the present gains beside the new ones, with what both do on the model.
-
-    :param case: the experiment; no rows where a model, gains or the present gains are missing.
-    """
-    new, present = case.best_gains, case.present
-    if case.model is None or new is None or present is None:
-        return ()
-    old = compared_numbers(present, performance_of(present, case))
-    then = compared_numbers(new, new)
-    return tuple(
-        Row(name, value, other, meaning)
-        for (name, value, meaning), (_, other, _) in zip(old, then, strict=False)
-    )
-
-
-def performance_of(present: Controller, case: Case) -> Performance | None:
-    """Return what the present gains do on the model; None: no model, or an unstable loop.
-
-    :param present: the gains.
-    :param case: the experiment.
-    """
-    if case.model is None:
-        return None
-    try:
-        return analyse_loop(present, in_loop(case, case.model.found.model))
-    except TuningError:
-        return None
-
-
-def compared_numbers(gains: Controller, does: Performance | None) -> list[tuple[str, str, str]]:
-    """Return the names, values and meanings by which gains are compared.
-
-    :param gains: the gains.
-    :param does: what they do on the model; None: they make the loop unstable.
-    """
-    rows = [
-        ("kc [u/y]", digits(gains.kc), ""),
-        ("ti [s]", digits(gains.ti), ""),
-        ("td [s]", digits(gains.td), ""),
-    ]
-    if does is None:
-        return [*rows, ("Ms", "-", "the present gains make the loop unstable on the model")]
-    return [
-        *rows,
-        ("Ms", digits(does.ms, 3), "below 1.4 careful, above 2 risky"),
-        (
-            "phase margin [deg]",
-            digits(math.degrees(does.phase_margin), 3),
-            "the larger, the calmer",
-        ),
-        (
-            "IAE after a load step [y s/u]",
-            digits(does.iae_load, 3),
-            "the smaller, the faster a load is compensated",
-        ),
-    ]
-
-
-def repeats_of(case: Case) -> tuple[NamedNumber, ...]:
-    """Return how to make the same report, and the same test, again: names and commands.
-
-    :param case: the experiment.
-    """
-    found = [NamedNumber("The same report:", case.command)] if case.command else []
-    relay = case.settings
-    if relay is not None and relay.amplitude > 0.0:
-        values = {
-            "amplitude": relay.amplitude,
-            "baseline": relay.baseline,
-            "bias": relay.bias,
-            "hysteresis": relay.hysteresis,
-        }
-        # ROS reads 1 as an integer, and refuses it for a number
-        given = " ".join(
-            f"-p {name}:={float(f'{value:.6g}')!r}"
-            for name, value in values.items()
-            if value and math.isfinite(value)
-        )
-        command = f"ros2 run relay_autotune relay_node --ros-args {given}"
-        found.append(NamedNumber("The same relay in a live loop:", command))
-    return tuple(found)
-
-
-def warnings_of(case: Case) -> tuple[str, ...]:
-    """Return the sentences that must be read before anything else.
-
-    :param case: the experiment.
-    """
-    doubtful = case.judgement.verdict is Verdict.DOUBTFUL
-    found = [f.said for f in case.judgement.findings if f.sentence] if doubtful else []
-    found += case.model.found.warnings if case.model is not None else ()
-    if case.best_gains is not None:
-        found += case.best_gains.warnings
-    disturbed = [c.index + 1 for c in case.cycles if c.disturbed]
-    if disturbed:
-        which = ", ".join(map(str, disturbed))
-        found.append(f"Cycle {which} was disturbed and is left out of the averages.")
-    return tuple(found)
-
-
-def checks_of(case: Case) -> tuple[Reason, ...]:
-    """Return the checks of the result.
-
-    :param case: the experiment.
-    """
-    return tuple(_check(found) for found in case.judgement.findings)
-
-
-def _check(found: Finding) -> Reason:
-    unit = f" {found.unit}" if found.unit else ""
-    meaning = found.said if found.sentence else f"{found.what[0].upper()}{found.what[1:]}"
-    return Reason(
-        found.title,
-        f"{_number(found.value)}{unit}, at most {_number(found.limit)}{unit}",
-        f"{meaning}.",
-        _TONES[found.result],
-    )
-
-
-def _number(value: float) -> str:
-    return f"{value:g}" if math.isinf(value) else digits(value, 3)
-
-
-def numbers_of(case: Case) -> tuple[NamedNumber, ...]:
-    """Return the numbers of the limit cycle.
-
-    :param case: the experiment.
-    """
-    cycle = case.limit_cycle
-    if cycle is None:
-        return ()
-    found = [
-        NamedNumber("period", f"{digits(cycle.period)} s"),
-        NamedNumber("high / low", f"{digits(cycle.period_high)} s / {digits(cycle.period_low)} s"),
-        NamedNumber("measurement", f"{digits(cycle.peak_min)} to {digits(cycle.peak_max)} y"),
-        NamedNumber("cycles averaged", f"{len(cycle.cycles)}"),
-        NamedNumber("limit cycle", "settled" if cycle.converged else "still changing"),
-    ]
-    if case.settings is not None:
-        found += [
-            NamedNumber("relay", f"±{digits(case.settings.amplitude)} u"),
-            NamedNumber("bias", f"{digits(case.settings.bias)} u"),
-            NamedNumber("hysteresis", f"±{digits(case.settings.hysteresis)} y"),
-        ]
-    return tuple(found)
-
-
-def doubts_of(case: Case) -> tuple[str, ...]:
-    """Return what remains uncertain, in sentences.
-
-    :param case: the experiment.
-    """
-    model = case.model
-    if model is None:
-        return ()
-    found = []
-    for estimate in model.estimates:
-        if not estimate.determined:
-            found.append(
-                f"The {estimate.title} is between {digits(estimate.low)} and "
-                f"{digits(estimate.high)} {estimate.unit}: more than 20 % to either side."
-            )
-    if model.found.rivals:
-        share = 100.0 * sum(r.support for r in model.found.rivals)
-        found.append(
-            f"Other structures hold {digits(share, 2)} % of the support; they are listed below."
-        )
-    if not found:
-        found.append("Nothing: every parameter is determined, and no other structure is a rival.")
-    return tuple(found)

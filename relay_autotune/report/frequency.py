@@ -20,7 +20,8 @@ from relay_autotune.loop.laws import LAWS
 from relay_autotune.loop.sampled import ClosedLoop, simulate_closed_loop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import NORMAL_95
-from relay_autotune.report.case import Case, EstimatedQuantity, ModelCase, in_loop, performance_of
+from relay_autotune.report.case import Case, EstimatedQuantity, ModelCase, in_loop
+from relay_autotune.report.findings import performance_of
 from relay_autotune.report.style import (
     BLUE,
     GREEN,

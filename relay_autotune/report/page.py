@@ -15,8 +15,9 @@ from markupsafe import Markup
 
 import relay_autotune
 from relay_autotune.process.transfer_function import process_mathml, process_text
-from relay_autotune.report.case import (
-    Case,
+from relay_autotune.report.case import Case
+from relay_autotune.report.figures import PLATES, Plate
+from relay_autotune.report.findings import (
     Chip,
     beside_present,
     checks_of,
@@ -28,7 +29,6 @@ from relay_autotune.report.case import (
     verdict_of,
     warnings_of,
 )
-from relay_autotune.report.figures import PLATES, Plate
 from relay_autotune.report.style import COLOURS, inline
 from relay_autotune.text import digits, plus_minus, visible
 

@@ -17,10 +17,10 @@ from relay_autotune.loop.laws import OWN_LAW
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.tuning.ensemble import ensemble_ms
+from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.rules import PUBLISHED, Rule
 from relay_autotune.tuning.rules.formulas import describing_point_of, is_first_order
 from relay_autotune.tuning.rules.step_response import two_point_fopdt
-from relay_autotune.tuning.search import robust
 from relay_autotune.tuning.task import DesignOptions, DesignTask, cautions, cost_of
 
 RULES: dict[str, Rule] = {"robust": robust, **PUBLISHED}

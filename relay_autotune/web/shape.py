@@ -23,7 +23,8 @@ from relay_autotune.loop.analysis import Loop, abscissae, inverted
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.process.response import ModelSet
 from relay_autotune.quantities import Quantity, declared
-from relay_autotune.report.case import Case, performance_of
+from relay_autotune.report.case import Case
+from relay_autotune.report.findings import performance_of
 from relay_autotune.report.frequency import (
     loop_frequencies,
     shown_load,

@@ -20,10 +20,8 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.record.record import Record
-from relay_autotune.report.case import (
-    Case,
-    EstimatedQuantity,
-    ModelCase,
+from relay_autotune.report.case import Case, EstimatedQuantity, ModelCase
+from relay_autotune.report.findings import (
     checks_of,
     compared_numbers,
     facts_of,

@@ -16,7 +16,8 @@ from relay_autotune.cli.jobs import status_of
 from relay_autotune.cli.table import table
 from relay_autotune.exchange.messages import fill_gains
 from relay_autotune.exchange.models import document
-from relay_autotune.report.case import case_of, cases_of_document, checks_of, verdict_of
+from relay_autotune.report.case import case_of, cases_of_document
+from relay_autotune.report.findings import checks_of, verdict_of
 from relay_autotune.report.page import page
 from relay_autotune.verdict import NOT_JUDGED, Verdict
 

@@ -19,7 +19,8 @@ from relay_autotune.process.structures import UNSTABLE_FOPDT, UNSTABLE_SOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import design
 from relay_autotune.tuning.frontier import Bounds
-from relay_autotune.tuning.search import Search, robust
+from relay_autotune.tuning.robust import robust
+from relay_autotune.tuning.search import Search
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 DESIGNS = cases("design.")

@@ -38,7 +38,6 @@ from relay_autotune.process.structures import (
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.report.case import (
     Case,
-    beside_present,
     case_of,
     cases_of_document,
     in_loop,
@@ -46,6 +45,7 @@ from relay_autotune.report.case import (
     true_value,
 )
 from relay_autotune.report.figures import PLATES
+from relay_autotune.report.findings import beside_present
 from relay_autotune.report.page import page
 from relay_autotune.report.style import COLOURS
 

@@ -10,7 +10,7 @@ from concurrent.futures import Future, wait
 import pytest
 
 from relay_autotune.errors import TuningError
-from relay_autotune.web.server import Worker
+from relay_autotune.web.worker import Worker
 
 
 def ended(worker: Worker, work: Future):

@@ -1,0 +1,426 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""Text with columns of numbers: its encoding, its separator, its header and its cells.
+
+The rows of numbers tell where the table begins and what separates its columns: the separator is
+the one that makes the most numbers, and the header is the text just above the first of them.
+What the text does not tell is guessed, and each guess is a note.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta, timezone
+from itertools import chain, islice, pairwise
+from pathlib import Path
+from typing import BinaryIO, TextIO
+
+import numpy as np
+
+from relay_autotune.bag.arrays import FloatArray, IntArray
+from relay_autotune.bag.limits import LARGEST_TEXT, LONGEST_LINE
+from relay_autotune.errors import BagError, visible
+
+# Each is preferred to those after it where both make as many numbers: beside a semicolon, a tab
+# or a space a comma may be the decimal point.
+_SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
+_REMARKS = ("#", "%", "//")
+# The beginning of a file that tells its encoding and its separator [bytes].
+_FIRST = 64 << 10
+# Largest number of lines before the rows of numbers.
+_LONGEST_HEAD = 1000
+# Largest share of rows with text in place of a number that are left out; more are a fault.
+_DAMAGED = 0.02
+_MISSING = frozenset(("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--"))
+_SWITCH = {"on": 1.0, "off": 0.0, "true": 1.0, "false": 0.0}
+_QUANTITY = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*(%|[^\W\d_/]{1,4}|\u00b0\w?)")
+_1970 = datetime(1970, 1, 1, tzinfo=UTC)
+_DATE = re.compile(
+    r"(?:(\d{1,4})([-/.])(\d{1,2})\2(\d{1,4})(?:T|,?\s+))?"
+    r"(\d{1,2}):(\d\d)(?::(\d\d)(?:[.,](\d{1,9}))?)?\s*([AaPp][Mm])?\s*(Z|[+-]\d\d:?\d\d)?"
+)
+
+
+@dataclass(frozen=True)
+class Times:
+    """The times of the rows in one of three forms, the others empty; all empty: they have none.
+
+    :param numbers: as they stand.
+    :param dates: nanoseconds since 1970.
+    :param clock: times of day [ns].
+    """
+
+    numbers: list[float] = field(default_factory=list)
+    dates: list[int] = field(default_factory=list)
+    clock: list[int] = field(default_factory=list)
+
+
+class TextTable:
+    """The rows of a text: their separator, their header, their numbers.
+
+    :param path: its name in messages.
+    :param file: the file, from its beginning.
+    :raises BagError: if it holds no table.
+    """
+
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self._path = path
+        self.notes: list[str] = []
+        self.lines: IntArray = np.empty(0, dtype=np.int64)
+        size = file.seek(0, io.SEEK_END)
+        if size > LARGEST_TEXT:
+            raise BagError(
+                f"{path} has {size} bytes, more than the {LARGEST_TEXT} that are read of a text; "
+                "cut it into parts, or make a bag of it"
+            )
+        file.seek(0)
+        first = file.read(_FIRST)
+        file.seek(0)
+        # Closing the text would close the file a second time.
+        self._text = io.TextIOWrapper(file, newline="", encoding=self._encoding(first))
+        separator = _separator(self._text.read(_FIRST // 4))
+        self._text.seek(0)
+        if separator != ",":
+            self.notes.append(f"columns are taken as separated by {_SEPARATORS[separator]}")
+        self._separator = separator
+        self._reader = csv.reader(
+            _lines(path, self._text, separator),
+            delimiter=separator,
+            skipinitialspace=separator != "\t",
+        )
+        self._commas = self._points = False
+        self._head: list[str] = []
+        self._waiting: list[tuple[int, list[str]]] = []
+        self.units: dict[str, str] = {}
+        self.names = self._header()
+        self._day = self._day_before_its_time()
+        self.names = self._joined(self.names)
+
+    def _encoding(self, first: bytes) -> str:
+        if first[:2] in (b"\xff\xfe", b"\xfe\xff"):
+            return "utf-16"
+        with suppress(UnicodeDecodeError):
+            # A character may be cut at the end.
+            first[: first.rfind(b"\n") + 1 or None].decode("utf-8-sig")
+            return "utf-8-sig"
+        if b"\0" in first:
+            return "utf-8-sig"
+        self.notes.append("the text is not UTF-8 and is taken as Latin-1")
+        return "latin-1"
+
+    def _header(self) -> list[str]:
+        """Return the names of the columns; the rows of numbers wait."""
+        rows: list[tuple[int, list[str]]] = []
+        for row in islice(self._reader, _LONGEST_HEAD):
+            cells = [cell.strip() for cell in row]
+            if any(cells):
+                rows.append((self._reader.line_num, cells))
+            # One row of numbers may be a remark, such as the gains of a controller.
+            if len(rows) > 1 and _are_data(rows[-2][1], rows[-1][1]):
+                data = len(rows) - 2
+                break
+        else:
+            data = next((k for k, (_, cells) in enumerate(rows) if _is_data(cells)), len(rows))
+        if not rows:
+            raise BagError(f"{self._path} is empty; expected a header line, then rows of numbers")
+        self._waiting = rows[data:]
+        width = len(self._waiting[0][1]) if self._waiting else 0
+        # A separator at the end of each line makes no column.
+        filled = max(
+            (k + 1 for _, row in self._waiting for k, c in enumerate(row) if c), default=0
+        )
+        above = [(line, _bare(cells, filled)) for line, cells in rows[:data]]
+        fits = [self._is_header(cells, filled) for _, cells in above]
+        if not fits or not fits[-1]:
+            if not width:
+                raise BagError(
+                    f"{self._path} has 0 rows of numbers; expected columns of time, measurement "
+                    "and command, separated by commas, semicolons, tabs or spaces"
+                )
+            names = [str(number) for number in range(1, width + 1)]
+            why = "there is no header line"
+            if above and not _is_data(above[-1][1]) and sum(map(bool, above[-1][1])) > width // 2:
+                why = (
+                    f"line {above[-1][0]} has {len(above[-1][1])} names and the rows have {width} "
+                    "cells, so that it does not tell which is which"
+                )
+            self.notes.append(f"{why}; the columns are called {listed(names)}")
+            return names
+        line, cells = above[-1]
+        units: list[str] = []
+        if len(above) > 1 and fits[-2] and len(above[-2][1]) == len(cells) and _are_units(cells):
+            self.notes.append(f"line {line} holds no number and is taken for units")
+            units, (line, cells) = cells, above[-2]
+        self._head = cells
+        while not cells[-1] and len(cells) > filled:
+            cells = cells[:-1]
+        names = [visible(name) for name in cells]
+        self.units = {name: unit for name, unit in zip(names, units, strict=False) if unit}
+        return names
+
+    def _day_before_its_time(self) -> int | None:
+        """Return the place of a column of dates just before one of times of day; None: none."""
+        cells = self._waiting[0][1] if self._waiting else []
+        for at, (day, time) in enumerate(pairwise(cells)):
+            both = _date(f"{day} {time}")
+            if both is not None and both[1] and _date(day) is None:
+                named = listed(self.names[at : at + 2])
+                self.notes.append(f"the columns {named} are read as one, of date and time")
+                return at
+        return None
+
+    def _joined(self, cells: list[str]) -> list[str]:
+        """Return cells with a date and the time of day behind it as one."""
+        at = self._day
+        if at is None or len(cells) < at + 2:
+            return cells
+        return [*cells[:at], " ".join(cells[at : at + 2]), *cells[at + 2 :]]
+
+    def _is_header(self, cells: Sequence[str], width: int) -> bool:
+        # Names with spaces in them make more cells than there are columns.
+        fits = len(cells) == width if self._separator == " " else len(cells) >= max(width, 2)
+        return fits and sum(map(bool, cells)) >= 2 and not _is_data(cells)
+
+    def _rows(self) -> Iterator[tuple[int, list[str]]]:
+        """Yield each row of numbers with its line number."""
+        following = ((self._reader.line_num, row) for row in self._reader)
+        left_out = 0
+        for line, row in chain(self._waiting, following):
+            if not any(cell.strip() for cell in row):
+                continue
+            cells = [cell.strip() for cell in row]
+            if cells[0].startswith(_REMARKS) or (self._head and cells == self._head):
+                left_out += 1
+                continue
+            cells = self._joined(cells)
+            # A separator at a line's end is no cell.
+            if any(cells[len(self.names) :]):
+                raise BagError(
+                    f"{self._path}, line {line}: {len(cells)} cells, but {len(self.names)} "
+                    f"columns have a name; a decimal comma, or a separator within a text, would "
+                    f"make such a line"
+                )
+            yield line, cells
+        if left_out:
+            self.notes.append(f"{left_out} lines between the rows hold remarks and are left out")
+
+    def columns(self, time: int | None, places: Sequence[int]) -> tuple[Times, list[FloatArray]]:
+        """Return the times and the columns at some places; NaN: an empty cell.
+
+        :param time: the place of the time; None: there is none, and rows are counted.
+        :param places: of the other columns.
+        :raises BagError: if a cell holds anything but a number.
+        """
+        times = Times()
+        values: list[list[float]] = [[] for _ in places]
+        suffixes: list[str | None] = [None] * len(places)
+        lines: list[int] = []
+        untimed, damaged = 0, []
+        for line, row in self._rows():
+            stamp = "" if time is None or time >= len(row) else row[time]
+            if time is not None and stamp.lower() in _MISSING:
+                untimed += 1
+                continue
+            try:
+                found = self._numbers(line, row, places, suffixes)
+                if time is not None:
+                    self._stamp(line, time, stamp, times)
+            except BagError as error:
+                damaged.append(error)
+                continue
+            for column, number in zip(values, found, strict=True):
+                column.append(number)
+            lines.append(line)
+        if damaged and len(damaged) > _DAMAGED * len(lines):
+            raise damaged[0]
+        if len(lines) < 2:
+            raise BagError(f"{self._path} has {len(lines)} rows of numbers; expected at least two")
+        for count, what in ((len(times.dates), "dates"), (len(times.clock), "times of day")):
+            if time is not None and 0 < count < len(lines):
+                raise BagError(
+                    f"{self._path}: of {len(lines)} cells of {self.names[time]!r} {count} are "
+                    f"{what}, the others not; expected one of them"
+                )
+        if self._commas and self._points:
+            raise BagError(
+                f"{self._path} has numbers with a decimal comma and others with a point; "
+                "expected one of them"
+            )
+        if self._commas:
+            self.notes.append("a comma within a number is taken as the decimal point")
+        if untimed:
+            self.notes.append(f"{untimed} rows without a time are left out")
+        if damaged:
+            self.notes.append(
+                f"{len(damaged)} rows hold something else than numbers and are left out, "
+                f"the first: {str(damaged[0]).removeprefix(f'{self._path}, ')}"
+            )
+        self.lines = np.array(lines, dtype=np.int64)
+        return times, [np.array(column) for column in values]
+
+    def _numbers(
+        self, line: int, row: list[str], places: Sequence[int], suffixes: list[str | None]
+    ) -> list[float]:
+        """Return the numbers of a row at some places; NaN: an empty cell.
+
+        :param suffixes: the units behind the numbers of each place so far, which stay the same.
+        """
+        found = []
+        for k, at in enumerate(places):
+            cell = row[at] if at < len(row) else ""
+            number, suffix = self._number(line, at, cell)
+            found.append(number)
+            if math.isnan(number):
+                continue
+            if suffixes[k] not in (None, suffix):
+                raise self._no_number(line, at, cell)
+            suffixes[k] = suffix
+        return found
+
+    def _stamp(self, line: int, at: int, cell: str, times: Times) -> None:
+        date = None if _is_number(cell) else _date(cell)
+        if date is None:
+            times.numbers.append(self._number(line, at, cell)[0])
+        else:
+            (times.dates if date[1] else times.clock).append(date[0])
+
+    def _number(self, line: int, at: int, cell: str) -> tuple[float, str]:
+        """Return a number, NaN of an empty cell, and the unit behind it."""
+        low = cell.lower()
+        if low in _MISSING:
+            return math.nan, ""
+        if low in _SWITCH:
+            return _SWITCH[low], "on or off"
+        text, suffix = cell, ""
+        if not _is_number(text) and (quantity := _QUANTITY.fullmatch(text)) is not None:
+            text, suffix = quantity[1], quantity[2]
+        if self._separator != ",":
+            # "1.234,5" is neither.
+            if "," in text and "." not in text and text.count(",") == 1:
+                text, self._commas = text.replace(",", "."), True
+            elif "." in text:
+                self._points = True
+        if not _is_number(text):
+            raise self._no_number(line, at, cell)
+        value = float(text)
+        if not math.isfinite(value):
+            raise self._no_number(line, at, cell, finite=True)
+        return value, suffix
+
+    def _no_number(self, line: int, at: int, cell: str, *, finite: bool = False) -> BagError:
+        shown = cell if finite else repr(visible(cell))
+        return BagError(
+            f"{self._path}, line {line}: {self.names[at]!r} is {shown}; expected a "
+            f"{'finite ' if finite else ''}number"
+        )
+
+
+def _lines(path: Path, text: TextIO, separator: str) -> Iterator[str]:
+    """Yield the lines of a text, and refuse one that is too long."""
+    while line := text.readline(LONGEST_LINE + 1):
+        if len(line) > LONGEST_LINE:
+            raise BagError(
+                f"{path} has a line of more than {LONGEST_LINE} characters; no CSV file"
+            )
+        # Where spaces separate, several are one, and a tab is one, too.
+        yield " ".join(line.split()) + "\n" if separator == " " else line
+
+
+def _separator(first: str) -> str:
+    """Return the separator that makes the most numbers of the first lines."""
+    lines = [line for line in first.splitlines()[:200] if line.strip()]
+
+    def numbers(mark: str) -> int:
+        counts = (
+            sum(map(_is_value, line.split() if mark == " " else line.split(mark)))
+            for line in lines
+        )
+        return sum(count for count in counts if count > 1)
+
+    # The first of several that make as many.
+    best = max(_SEPARATORS, key=numbers)
+    return best if numbers(best) else ","
+
+
+def _bare(cells: Sequence[str], width: int) -> list[str]:
+    """Return the cells of a line without the mark of a remark, and without what a program adds."""
+    first = cells[0].lstrip("#%/ ")
+    rest = [first, *cells[1:]]
+    # "# t y u" separated by spaces, or a program's indent
+    spare = len(rest) - width
+    return rest[spare:] if width and spare > 0 and not any(rest[:spare]) else rest
+
+
+def _is_data(cells: Sequence[str]) -> bool:
+    return not cells[0].startswith(_REMARKS) and sum(map(_is_value, cells)) >= 2
+
+
+def _are_data(first: Sequence[str], second: Sequence[str]) -> bool:
+    return len(first) == len(second) and _is_data(first) and _is_data(second)
+
+
+def _is_value(cell: str) -> bool:
+    text = cell.strip()
+    quantity = _QUANTITY.fullmatch(text)
+    number = (quantity[1] if quantity else text).replace(",", ".")
+    return bool(text) and (_is_number(number) or _date(text) is not None)
+
+
+def _are_units(row: Sequence[str]) -> bool:
+    cells = [cell for cell in row if cell]
+    return len(cells) >= 2 and not any(re.search(r"\d", cell) for cell in cells)
+
+
+def _date(cell: str) -> tuple[int, bool] | None:
+    """Return a date in nanoseconds since 1970, UTC where it names no zone, or a time of day.
+
+    The second value tells whether it is a date. Of three numbers one of four digits is the year,
+    and 1/2 is the second of January unless a number above 12 says otherwise; 1.2 the first of
+    February.
+    """
+    match = _DATE.fullmatch(cell)
+    if match is None:
+        return None
+    a, mark, b, c, hour, minute, second, fraction, half, zone = match.groups()
+    hours = int(hour) % 12 + 12 * (half.lower() == "pm") if half else int(hour)
+    seconds = int(hours) * 3600 + int(minute) * 60 + int(second or 0)
+    ns = seconds * 10**9 + int((fraction or "0").ljust(9, "0"))
+    if a is None:
+        return ns, False
+    first, middle, last = int(a), int(b), int(c)
+    if len(a) == 4:
+        year, month, day = first, middle, last
+    else:
+        year = last + 2000 * (last < 100)
+        day_first = mark != "/" or first > 12
+        day, month = (first, middle) if day_first else (middle, first)
+    away = timedelta()
+    if zone and zone != "Z":
+        away = timedelta(hours=int(zone[1:3]), minutes=int(zone[-2:])) * (
+            1 if zone[0] == "+" else -1
+        )
+    try:
+        midnight = datetime(year, month, day, tzinfo=timezone(away))
+    except ValueError:
+        return None
+    return (midnight - _1970) // timedelta(microseconds=1) * 1000 + ns, True
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names in quotes."""
+    return ", ".join(repr(name) for name in names)
