@@ -19,7 +19,7 @@ from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.residuals import ljung_box
-from relay_autotune.identification.waveform.separable import problem_of
+from relay_autotune.identification.waveform.separable import TRIAL, evaluate, problem_of, refine
 from relay_autotune.identification.waveform.starts import latest_dead_time, multistart
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import RelayRun, simulate_relay
@@ -361,6 +361,20 @@ def test_a_structure_of_which_no_fit_can_begin_is_left_out():
     # One of those that are fitted whatever others promise.
     problem = problem_of([told], TABLE["fopdt"])
     assert multistart(problem, [], 1e-6) is None
+
+
+def test_a_fit_ends_where_lags_far_below_the_period_explain_nothing_more():
+    """Its steps promise gains of 1e-150, and rounding of the cost is a gain all the same."""
+    rng = np.random.default_rng(4)
+    u = PiecewiseConstant(np.arange(0.0, 20.0, 0.004), rng.normal(size=5000), 0.0)
+    time = np.arange(0.0015, 20.0, 0.088)
+    y = rng.normal(0.0, 0.1, time.size)
+    problem = problem_of([(time, y, u)], TABLE["sopdt"])
+    for log_tau in np.linspace(-14.5, -12.5, 20):
+        for log_damping in (0.0, 0.589):
+            start = np.array((log_tau, log_damping, 0.0))
+            found = refine(problem, start, tolerance=TRIAL, damping=0.134)
+            assert found.cost <= evaluate(problem, start).cost
 
 
 @pytest.mark.long

@@ -489,7 +489,9 @@ def refine(
             continue
         gained = state.cost - trial.cost
         # The damping follows the ratio of the actual gain to the predicted one (Nielsen 1999).
-        factor = 1.0 - (2.0 * gained / predicted - 1.0) ** 3 if predicted > 0.0 else 1.0
+        # From a ratio of 1 on it is the least one.
+        ratio = gained / predicted if predicted > gained else 1.0
+        factor = 1.0 - (2.0 * ratio - 1.0) ** 3 if predicted > 0.0 else 1.0
         damping = max(damping * min(max(factor, 0.1), 2.0), _LEAST_DAMPING)
         growth = _GROWTH
         state = trial
