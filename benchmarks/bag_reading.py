@@ -35,7 +35,7 @@ from relay_autotune.bag.bag_file import McapFile
 from relay_autotune.bag.topics import Topics
 
 TOPICS = ("/measurement", "/command")
-MESSAGES, QUICK_MESSAGES = 2_000_000, 4_000
+MESSAGES, QUICK_MESSAGES = 2_000_000, 200_000
 GROWTH = (100_000, 1_000_000, 10_000_000, 30_000_000)
 QUICK_GROWTH = (10_000, 100_000)
 # 27 MB a second.

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -48,17 +49,34 @@ class Figure:
         return self.value >= self.target if self.is_least else self.value <= self.target
 
     def loss(self, earlier: Figure) -> float:
-        """Return how many times worse it is than an earlier one."""
-        ratio = self.comparable / earlier.comparable
-        return 1.0 / ratio if self.is_least else ratio
+        """Return how many times worse it is than an earlier one; 1 where both are nothing."""
+        if not self.is_least and self.value <= _FAR_BELOW * self.target:
+            return 1.0
+        worse, better = self.comparable, earlier.comparable
+        if self.is_least:
+            worse, better = better, worse
+        return worse / better if better else math.inf
 
 
 _MULTIPLE = "x reference"
-_CELL = re.compile(r"(?P<sign>[<>]=)? ?(?P<number>\d[\d,]*(\.\d+)?)")
+_CELL = re.compile(r"(?P<sign>[<>]=)? ?(?P<number>\d[\d,]*(\.\d+)?(e[-+]\d+)?)")
+# A figure below this share of its bound may vary freely: rounding, or no lost sample.
+_FAR_BELOW = 0.01
 
 
 def _is_target(cell: str) -> bool:
     return cell.startswith("target")
+
+
+def naming(text: str) -> int:
+    """Return how many columns at the beginning tell all rows that have a target apart.
+
+    :param text: with tables as `table` makes them.
+    """
+    columns = 1
+    while len(figures(text, columns)) < len(figures(text, columns + 1)):
+        columns += 1
+    return columns
 
 
 def figures(text: str, naming: int) -> dict[tuple[str, ...], Figure]:
