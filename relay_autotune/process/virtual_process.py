@@ -16,6 +16,8 @@ from relay_autotune.process.response import Modes
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import check, quantity
 
+_EPSILON = float(np.finfo(float).eps)
+
 
 @dataclass
 class Actuator:
@@ -95,7 +97,7 @@ class Plant:
         self._dead_time = model.dead_time
         self._modes = Modes.of(model)
         self._z = self._modes.rest()
-        self._states = self._modes.split(self._z)
+        self._states, self._rounding = self._modes.split(self._z), 0.0
         self._since = 0.0
         self._command = initial_command
         self._arrived = initial_command
@@ -117,12 +119,15 @@ class Plant:
         while self._on_the_way and self._on_the_way[0][0] <= time:
             self._arrive(*self._on_the_way.popleft())
         self.time = time
-        return float(self._modes.outputs(self._states, np.array([time - self._since]))[0, 0])
+        y = float(self._modes.outputs(self._states, np.array([time - self._since]))[0, 0])
+        # At the arrival of the first command the parts cancel, but for rounding.
+        return y if abs(y) > self._rounding else 0.0
 
     def _arrive(self, time: float, command: float) -> None:
         z = self._modes.move(self._z, time - self._since)
         self._z = z + (command - self._arrived) * self._modes.input_direction
         self._states = self._modes.split(self._z)
+        self._rounding = _EPSILON * self._modes.size_of(self._states)
         self._since, self._arrived = time, command
 
 

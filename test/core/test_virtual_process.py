@@ -12,7 +12,12 @@ import pytest
 
 from relay_autotune.errors import ParameterError
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.virtual_process import Actuator, Disturbances, VirtualProcess
+from relay_autotune.process.virtual_process import (
+    Actuator,
+    Disturbances,
+    Plant,
+    VirtualProcess,
+)
 
 MODEL = TransferFunction.fopdt(2.0, 5.0, 1.3)
 
@@ -78,3 +83,12 @@ def test_a_negative_size_is_refused(name: str) -> None:
 def test_an_infinite_disturbance_is_refused(name: str) -> None:
     with pytest.raises(ParameterError, match=f"{name} is inf, expected a finite number"):
         Disturbances(**{name: math.inf})
+
+
+def test_a_command_shows_no_rounding_when_it_arrives() -> None:
+    """A relay without hysteresis would take it for the answer, and its sign for the gain's."""
+    model = TransferFunction(0.547, (-0.418,), (1.06, 2.3), 1, 0.1)
+    for height in np.linspace(0.1, 3.0, 40):
+        plant = Plant(model)
+        assert plant.advance(0.1, height) == 0.0
+        assert plant.advance(0.2, height) < 0.0
