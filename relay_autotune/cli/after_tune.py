@@ -56,7 +56,7 @@ from relay_autotune.cli.tune_view import (
     wants_colour,
 )
 from relay_autotune.control.verification import Step, allowed_steps, noise_of, plan, proving_step
-from relay_autotune.errors import RelayAutotuneError, TuningError
+from relay_autotune.errors import RelayAutotuneError, SelectionError, TuningError
 from relay_autotune.exchange.export import (
     EXPORTS,
     WITHOUT_LAW,
@@ -399,9 +399,7 @@ class AfterTune:
         if loop.proves and not (file or options.yes) and sys.stdin.isatty():
             written, file = self._asked(first, against)
         if file:
-            text = exported(written.gains, written.how, loop.target, doubt=written.doubt)
-            write(text, file)
-            print(f"  {'gains for':<16} {written.how}: {Path(file).resolve()}")
+            self._write(written, file)
         if written.gains is not gains and not against:
             law = {"law": written.gains.law, "sample_period": written.gains.law_period}
             again = as_typed(PROGRAM, self.parser, options, verify=None, **law)
@@ -409,6 +407,18 @@ class AfterTune:
         if (status := loop.apply(written.doubt)) is not None:
             proven = status == DONE
         return proven, steps
+
+    def _write(self, written: _Written, file: str) -> None:
+        try:
+            text = exported(written.gains, written.how, self.loop.target, doubt=written.doubt)
+        except SelectionError as error:
+            # The tune is made, and its recording has the gains.
+            bag = shlex.quote(self.result.bag or "BAG")
+            again = f"{prefix()}replay {bag} --export {written.how}"
+            say(PROGRAM, f"{file} is not written: {error}, such as {again}")
+            return
+        write(text, file)
+        print(f"  {'gains for':<16} {written.how}: {Path(file).resolve()}")
 
     def _asked(self, first: _Written, against: str) -> tuple[_Written, str]:
         """Ask for which program the gains are to be written, and to which file.

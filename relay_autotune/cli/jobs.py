@@ -38,6 +38,7 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import declared
+from relay_autotune.record.excitation import resting_command
 from relay_autotune.record.record import Record
 from relay_autotune.recordings import read_experiments
 from relay_autotune.result import Analysis
@@ -199,9 +200,13 @@ def _exported(
             "--accept-doubtful to export them anyway"
         )
     assert only.best_gains is not None
-    if only.record.settings is not None:
-        target = replace(target, present=only.record.settings.baseline)
-    return exported(only.best_gains, how, target, doubt=only.judgement.reason).rstrip("\n")
+    to = _from_rest(target, only.record)
+    return exported(only.best_gains, how, to, doubt=only.judgement.reason).rstrip("\n")
+
+
+def _from_rest(target: Target, record: Record | None) -> Target:
+    """Return where gains go with the command at which a record rests, if it does."""
+    return target if record is None else replace(target, present=resting_command(record))
 
 
 def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> str:
@@ -485,7 +490,7 @@ def show(
                 program, parser, options, web=None, web_address=None, export=None, **changed
             )
 
-        return PageModel(case, shaping, first, command, target=target)
+        return PageModel(case, shaping, first, command, target=_from_rest(target, case.record))
 
     subjects = [subject(case, shaping) for case, shaping in models]
 

@@ -151,6 +151,12 @@ def settings(gains: Gains, law: Law, target: Target) -> str:
     :param target: with the clamps of the command, which become a remark.
     """
     limits = (target.command_min, target.command_max)
+    if law.unset and not all(map(math.isfinite, limits)):
+        raise SelectionError(
+            f"{law.name} always limits its command, and to {law.unset} where nothing else is set: "
+            "give the lowest and the highest command, --command-min and --command-max of replay "
+            "or tune"
+        )
     where = ""
     if law.bounds is None:
         low, high = (f"{limit:g}" if math.isfinite(limit) else "none" for limit in limits)
@@ -169,10 +175,13 @@ def settings(gains: Gains, law: Law, target: Target) -> str:
         values += _texts(law.bounds(*limits))
     if law.start is not None:
         known = not math.isnan(target.present)
-        at = f" At the tune it was {target.present:.6g} u." if known else ""
+        present, at = target.present, f" The process rested at {target.present:.6g} u."
+        if not known:
+            # A program that cannot do without one begins at the command next to 0.
+            present = min(max(0.0, limits[0]), limits[1])
+            at = f" It is not known here: put it in place of {present:g}." * law.start.needs
         told += (f"Start without a bump: {law.start.words}{at}",)
         if law.start.name and (known or law.start.needs):
-            present = target.present if known else 0.0
             start = law.start.value(law.at(gains, gains.law_period), present)
             values.append((law.start.name, number(start)))
     return _written(law, _comments(gains, told, law.remark), values)

@@ -267,7 +267,7 @@ class Start:
     :param words: what to do, a sentence.
     :param name: the input that takes the value; empty: it has none.
     :param value: of that input, from the law with its gains and the command [u].
-    :param needs: True if its text does not work without a value, which is then 0.
+    :param needs: True if its text does not work without a value.
     """
 
     words: str
@@ -299,6 +299,7 @@ class Law:
     :param tail: what stands below them.
     :param bounds: its settings for the limits of the command, of which each may be infinite;
         None: they are set elsewhere in the program.
+    :param unset: the limits that its program takes where none are set; empty: it has none then.
     :param remark: beginning of a line that is a comment.
     :param sign: what to know where its gains have not the sign of kc; ``{sign}`` is theirs.
     :param start: how it begins from the present command; None: its program has no way.
@@ -323,6 +324,7 @@ class Law:
     line: str = "{name}: {value}"
     tail: str = ""
     bounds: Bounds | None = None
+    unset: str = ""
     remark: str = "#"
     sign: str = ""
     start: Start | None = None
@@ -662,11 +664,8 @@ _ROWS = (
         weights=(0.0, 1.0),
         head="#include <PID_v1.h>\n",
         line="const auto {name} = {value};",
-        # Without other limits the library has 0 to 255.
-        bounds=lambda low, high: (
-            ("OutputMin", low if math.isfinite(low) else 0.0),
-            ("OutputMax", high if math.isfinite(high) else 255.0),
-        ),
+        bounds=lambda low, high: (("OutputMin", low), ("OutputMax", high)),
+        unset="0 to 255",
         tail="""
 double Setpoint = 0.0, Input = 0.0, Output = StartOutput;
 PID controller(&Input, &Output, &Setpoint, Kp, Ki, Kd, POn, ControllerDirection);

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from relay_autotune.arrays import FloatArray, IntArray
-from relay_autotune.record.record import Record, roughness
+from relay_autotune.record.record import Input, Record, cached_on_record, roughness
 
 # Least number of switches between two levels for a relay phase: two whole cycles.
 _FEWEST_SWITCHES = 4
@@ -49,6 +49,11 @@ _MOST_FOR_SPEED = 2000
 _NOISE = 4.0
 _SHARE = 0.05
 
+# Least number of samples of a rest that shows the past; the largest share of its range by which
+# the measurement moves during it, and by which it would, going on like that, in the whole record.
+_ENOUGH_REST = 15
+_STILL, _STILL_LATER = 0.05, 0.5
+
 
 @dataclass(frozen=True)
 class Stretch:
@@ -81,6 +86,40 @@ def find_experiments(record: Record) -> tuple[Stretch, ...]:
     for first, last in _unbroken(record):
         found += _in_part(record, first, last)
     return tuple(found)
+
+
+def begins_at_rest(time: FloatArray, y: FloatArray, u: Input) -> bool:
+    """Return whether an experiment begins with a rest, which shows what came before.
+
+    :param time: of the samples [s], shape (n,).
+    :param y: the measurement, shape (n,).
+    :param u: the input.
+    """
+    changes = u.times[(u.times >= time[0]) & (u.times < time[-1])]
+    before = time < (changes[0] if changes.size else time[0])
+    if np.count_nonzero(before) < _ENOUGH_REST:
+        return False
+    t, wide = time[before] - float(np.mean(time[before])), float(np.ptp(y))
+    slope = float(t @ y[before]) / float(t @ t)
+    left = y[before] - np.mean(y[before]) - slope * t
+    chance = 2.0 * math.sqrt(float(left @ left) / left.size / float(t @ t))
+    if abs(slope) * float(np.ptp(t)) > _STILL * wide:
+        return False
+    return abs(slope) <= chance or abs(slope) * float(np.ptp(time)) <= _STILL_LATER * wide
+
+
+@cached_on_record
+def resting_command(record: Record) -> float:
+    """Return the command at which a process rests before its test [u]; NaN: it does not.
+
+    :param record: a record of any origin.
+    """
+    if record.settings is not None:
+        return record.settings.baseline
+    u = record.input()
+    if not begins_at_rest(record.time, record.measurement, u):
+        return math.nan
+    return float(u(record.time[:1])[0])
 
 
 def _unbroken(record: Record) -> list[tuple[int, int]]:

@@ -210,7 +210,8 @@ def settings_of(text: str) -> dict[str, str]:
 
 @pytest.mark.parametrize("name", [n for n, law in LAWS.items() if not law.sets_gains])
 def test_a_law_gets_its_settings_in_the_words_of_its_program(name, capsys):
-    assert tune.main([*OVEN, "--pid", "--rule", "imc", "--export", name]) == 0
+    limits = ["--command-min", "0", "--command-max", "1"] * bool(LAWS[name].unset)
+    assert tune.main([*OVEN, "--pid", "--rule", "imc", "--export", name, *limits]) == 0
     text = capsys.readouterr().out
     law = LAWS[name]
     lines = text.splitlines()
@@ -264,7 +265,16 @@ def test_simple_pid_runs_what_is_exported(target):
     assert pid(-100.0, dt=0.5) == pytest.approx(100.0 if known else 264.0)
 
 
-@pytest.mark.parametrize("target", [OF_OVEN, Target()], ids=["told", "unknown"])
+def test_a_sketch_is_not_written_without_the_limits_of_its_command():
+    # PID_v1 has 0 to 255 unless it is told others, which fits a command of analogWrite alone.
+    for some in (Target(), Target(command_min=0.0), Target(command_max=100.0)):
+        with pytest.raises(SelectionError, match="--command-min and --command-max"):
+            exported(of_law("arduino_pid_v1"), "arduino_pid_v1", some)
+
+
+@pytest.mark.parametrize(
+    "target", [OF_OVEN, replace(OF_OVEN, command_min=20.0, present=math.nan)], ids=str
+)
 def test_an_arduino_sketch_compiles_and_starts_from_the_present_command(tmp_path, target):
     text = exported(of_law("arduino_pid_v1", -2.0), "arduino_pid_v1", target)
     (tmp_path / "PID_v1.h").write_text(PID_V1)
@@ -276,7 +286,10 @@ def test_an_arduino_sketch_compiles_and_starts_from_the_present_command(tmp_path
     given = [compiler, "-I", str(tmp_path), str(tmp_path / "sketch.cpp"), "-o", str(program)]
     subprocess.run(given, check=True)
     told = subprocess.run([program], check=True, capture_output=True, text=True).stdout.split()
-    low, high, start = (0.0, 100.0, 35.0) if target is OF_OVEN else (0.0, 255.0, 0.0)
+    known = target is OF_OVEN
+    low, start = (0.0, 35.0) if known else (20.0, 20.0)
+    assert ("The process rested at 35 u." in text) == known
+    assert ("It is not known here: put it in place of 20." in text) != known
     assert [float(word) for word in told] == [
         2.0,
         0.4,
@@ -284,7 +297,7 @@ def test_an_arduino_sketch_compiles_and_starts_from_the_present_command(tmp_path
         1.0,
         1.0,
         low,
-        high,
+        100.0,
         500.0,
         1.0,
         start,
@@ -364,6 +377,9 @@ def test_replay_writes_the_gains_for_the_cycle_that_the_recording_shows(tmp_path
     assert capsys.readouterr().out == ""
     text = file.read_text()
     assert "CYCLE := T#98.5ms;" in text
+    # The tank of this recording rests at 30 before its steps.
+    found = settings_of(text)
+    assert float(found["KP"]) * float(found["X0"]) == pytest.approx(30.0)
     assert "else the interval of the recording: give --sample-period" in text
 
 

@@ -532,8 +532,10 @@ def shown(
         *answers: str,
         command_type: str = FLOAT64,
         bag: str | None = None,
+        command_within: list[float] | None = given.command_within,
     ) -> str:
         typed.extend(answers)
+        given.command_within = command_within
         result.bag = tempfile.mkdtemp(dir=tmp_path) if bag is None else bag
         kinds["command_type"] = command_type
         monkeypatch.setattr(AfterTune, "_offered", lambda _: (passed, against))
@@ -547,6 +549,17 @@ def shown(
         return " ".join([told, "NEXT", *(word for step in steps for word in step)])
 
     return show
+
+
+def test_a_file_that_needs_limits_is_written_from_the_recording(
+    shown: Callable[..., str], tmp_path: Path
+) -> None:
+    asked = ("arduino_pid_v1", "0.5", "sketch.ino")
+    told = shown(None, "", *asked, bag="tune", command_within=None)
+    assert not (tmp_path / "sketch.ino").exists()
+    assert "NEXT control with these gains" in told
+    shown(None, "", *asked, bag="tune")
+    assert "const auto OutputMax = 100.0;" in (tmp_path / "sketch.ino").read_text()
 
 
 def test_gains_that_failed_are_not_recommended_and_their_file_says_so(

@@ -15,7 +15,7 @@ from sampled_relay import simulate_sampled_relay
 from relay_autotune.analysis import analyse
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.excitation import find_experiments
+from relay_autotune.record.excitation import find_experiments, resting_command
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
@@ -34,6 +34,18 @@ def spans(record):
         (s.kind, float(record.time[s.first]), float(record.time[s.last]))
         for s in find_experiments(record)
     ]
+
+
+def test_the_command_at_which_a_process_rests_before_its_test():
+    assert resting_command(commanded([1000.0], [30, 40])) == 30.0
+    # The rest of a part is that before its own steps.
+    whole = commanded([100.0, 1500.0], [30, 40, 35])
+    assert resting_command(whole.part(4000, len(whole))) == 40.0
+    relay = RelaySettings(setpoint=50.0, baseline=2.0, amplitude=1.0)
+    assert resting_command(replace(whole, settings=relay)) == 2.0
+    # It moves from a step before, or begins with its step.
+    assert math.isnan(resting_command(whole.part(400, len(whole))))
+    assert math.isnan(resting_command(commanded([0.0], [30, 40])))
 
 
 def test_a_step_with_rest_ten_times_as_long_as_itself_around_it():

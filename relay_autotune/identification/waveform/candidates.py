@@ -58,15 +58,12 @@ from relay_autotune.process.structures import (
     Structure,
 )
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.excitation import begins_at_rest
 from relay_autotune.record.record import PiecewiseConstant
 
 MOST_LAGS = 8
 _MOST_LAGS_WITH_ZERO = 4
 _SAMPLES_EACH = 8
-# Least number of samples of a rest that shows the past; the largest share of its range by which
-# the measurement moves during it, and by which it would, going on like that, in the whole record.
-_ENOUGH_REST = 15
-_STILL, _STILL_LATER = 0.05, 0.5
 # Least number of moves of a command that tell whether one came before the record.
 _MANY = 6
 # What may be estimated beside the model, as fields of a problem.
@@ -485,29 +482,14 @@ def needs_no_past(problem: Problem, sign: int) -> bool:
         changes_within(u, problem.time[part])
         for part, u in zip(problem.experiments, problem.inputs, strict=True)
     )
-    return not sign and all(c.size < _MANY for c in changes) and begins_at_rest(problem)
-
-
-def begins_at_rest(problem: Problem) -> bool:
-    """Return whether each experiment begins with a rest, which shows what came before.
-
-    :param problem: all samples.
-    """
-    for part, u in zip(problem.experiments, problem.inputs, strict=True):
-        time, y = problem.time[part], problem.y[part]
-        changes = changes_within(u, time)
-        before = time < (changes[0] if changes.size else time[0])
-        if np.count_nonzero(before) < _ENOUGH_REST:
-            return False
-        t, wide = time[before] - float(np.mean(time[before])), float(np.ptp(y))
-        slope = float(t @ y[before]) / float(t @ t)
-        left = y[before] - np.mean(y[before]) - slope * t
-        chance = 2.0 * math.sqrt(float(left @ left) / left.size / float(t @ t))
-        if abs(slope) * float(np.ptp(t)) > _STILL * wide:
-            return False
-        if abs(slope) > chance and abs(slope) * float(np.ptp(time)) > _STILL_LATER * wide:
-            return False
-    return True
+    return (
+        not sign
+        and all(c.size < _MANY for c in changes)
+        and all(
+            begins_at_rest(problem.time[part], problem.y[part], u)
+            for part, u in zip(problem.experiments, problem.inputs, strict=True)
+        )
+    )
 
 
 def drop_first_dead_time(problem: Problem, state: Trial) -> Problem:
