@@ -429,6 +429,8 @@ class Switching:
             self._is_doubtful = False
             self._setup.notes.append(Code.NOTE_SIGN(sign=_SIGNS[self.facts.sign]))
             self.facts = replace(self.facts, sign=-self.facts.sign)
+            # What one level drove away takes as long to come back, and longer with a bias.
+            load.waits_from = t + (t - self._course.relay.since) / levels.balance
             self._begin()
             return None
         if levels.can_grow:

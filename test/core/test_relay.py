@@ -222,6 +222,17 @@ def test_other_processes_oscillate_and_their_sign_is_found(model, gain, sign_giv
     assert tune.cycles[-1].converged
 
 
+def test_what_the_wrong_sign_drove_away_is_given_time_to_come_back():
+    """Rounding of one sample looks like a first answer, so that the inverse one counts."""
+    rounding = iter([*[0.0] * 21, 7e-17, *[0.0] * 30_000])
+    tune = experiment()
+    model = TransferFunction(0.547, (-0.418,), (1.06,), 1, 0.1 + 1e-12)
+    run(tune, Plant(model), 0.05, noise=lambda: next(rounding), samples=20_000)
+    assert tune.outcome is Outcome.COMPLETED, tune.reason
+    assert tune.facts.sign == 1
+    assert max(tune.record().measurement) > 5.0
+
+
 def test_an_unstable_process_oscillates_if_its_sign_is_given():
     tune = experiment(process_gain_sign=1)
     run(tune, FopdtPlant(-1.0, -1.0, 0.3), 0.005)
