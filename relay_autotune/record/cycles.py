@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.errors import RecordError
@@ -39,6 +40,11 @@ _ENOUGH_TO_TELL = 5
 
 # A stay at a level shorter than this fraction of the usual stay is noise at a switch.
 _SHORT_STAY = 0.1
+
+# A relay switches when the measurement comes to its level, within a share of its range, so that
+# this part of a stay at most is left then. A process that comes to rest, within 5 %, is there
+# after three time constants, and a timer lets it be for a fourth or more.
+_THERE, _LEFT = 0.05, 0.25
 
 
 @dataclass(frozen=True)
@@ -71,9 +77,9 @@ def find_cycles(record: Record) -> tuple[int, ...]:
 
     :param record: a record of any origin.
     :returns: indices as in ``Record.cycle_start``; empty if the command does not switch to a
-        high level from a low one at least twice.
+        high level from a low one at least twice, or by the clock.
     """
-    stretch = find_relay(record)
+    stretch = _find_following(record)
     return () if stretch is None else tuple(int(i) for i in stretch.up)
 
 
@@ -91,7 +97,7 @@ def infer_settings(record: Record) -> RelaySettings | None:
     :param record: a record of any origin.
     :returns: the settings, or None if the command is not that of a relay.
     """
-    stretch = find_relay(record)
+    stretch = _find_following(record)
     if stretch is None or stretch.down.size == 0:
         return None
     y = record.measurement
@@ -169,6 +175,61 @@ def find_relay(record: Record) -> RelayStretch | None:
     if best is None:
         return None
     return _stretch(record, begins, slice(*best))
+
+
+def _find_following(record: Record) -> RelayStretch | None:
+    """Return the stretch of :func:`find_relay`, unless its switches come by the clock."""
+    stretch = find_relay(record)
+    if stretch is None:
+        return None
+    at = np.sort(np.append(stretch.up, stretch.down))
+    return stretch if follow_measurement(record, at, np.isin(at, stretch.up)) else None
+
+
+def follow_measurement(record: Record, at: IntArray, rises: NDArray[np.bool_]) -> bool:
+    """Return whether switches follow the measurement, as those of a relay do.
+
+    A relay switches when the measurement comes to a level, which is the same each time. So the
+    switch comes soon after the first sample of its stay that is there. A timer lets the process
+    be there for long, or switches before.
+
+    :param record: a record of any origin.
+    :param at: sample of each switch, shape (m,).
+    :param rises: whether the command rises there, shape (m,).
+    """
+    y = record.measurement
+    margin = _THERE * float(np.ptp(y[at[0] : at[-1] + 1]))
+    # The command of a relay rises where the measurement has fallen, or where it has risen.
+    return (
+        margin > 0.0
+        and at[-1] > at[0]
+        and any(_left(record.time, side * y, at, rises, margin) < _LEFT for side in (-1.0, 1.0))
+    )
+
+
+def _left(
+    time: FloatArray, y: FloatArray, at: IntArray, rises: NDArray[np.bool_], margin: float
+) -> float:
+    """Return the share of the time for which the measurement is at its level before a switch.
+
+    Where it never comes there, the whole stay counts.
+
+    :param time: of the samples [s], shape (n,).
+    :param y: measurement, which has risen where the command rises, shape (n,).
+    :param at: sample of each switch, shape (m,).
+    :param rises: whether the command rises there, shape (m,).
+    :param margin: distance within which the measurement is there [y].
+    """
+    late = 0.0
+    for up in (True, False):
+        ends = 1 + np.flatnonzero(rises[1:] == up)
+        there = y if up else -y
+        level = np.median(there[at[ends]]) - margin
+        for begin, end in zip(at[ends - 1], at[ends], strict=True):
+            # It may have come right after the sample before.
+            come = begin + np.flatnonzero(there[begin + 1 : end + 1] >= level)
+            late += time[end] - time[come[0] if come.size else begin]
+    return float(late / (time[at[-1]] - time[at[0]]))
 
 
 def _levels(values: FloatArray) -> IntArray | None:

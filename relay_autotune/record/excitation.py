@@ -12,17 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relay_autotune.arrays import FloatArray, IntArray
+from relay_autotune.arrays import FloatArray
+from relay_autotune.record.cycles import follow_measurement
 from relay_autotune.record.record import Input, Record, cached_on_record, roughness
 
 # Least number of switches between two levels for a relay phase: two whole cycles.
 _FEWEST_SWITCHES = 4
 # A stay this many times the usual one ends a relay phase.
 _LONG_STAY = 4.0
-# A relay switches when the measurement comes to its level, so that this part of a stay at most is
-# left then. A process that comes to rest, within 5 %, is there after three time constants, and a
-# timer lets it be for a fourth or more.
-_LEFT = 0.25
 
 # Changes form one experiment unless the process rests between them this many times as long as it
 # moved.
@@ -313,48 +310,11 @@ def _levels(changes: _Changes, run: tuple[int, int]) -> tuple[float, float]:
 
 
 def _follows(record: Record, changes: _Changes, run: tuple[int, int]) -> bool:
-    """Return whether the switches of a run follow the measurement, as those of a relay do.
-
-    A relay switches when the measurement comes to a level, which is the same each time. So the
-    switch comes soon after the first sample of its stay that is there. A timer lets the process
-    be there for long, or switches before.
-    """
+    """Return whether the switches of a run follow the measurement, as those of a relay do."""
     begin, stop = run
     at = np.clip(np.searchsorted(record.time, changes.times[begin:stop]), 0, len(record) - 1)
-    y = record.measurement
-    margin = _SHARE * float(np.ptp(y[at[0] : at[-1] + 1]))
     rises = changes.levels[begin + 1 : stop + 1] > np.mean(_levels(changes, run))
-    # The command of a relay rises where the measurement has fallen, or where it has risen.
-    return (
-        margin > 0.0
-        and at[-1] > at[0]
-        and any(_left(record.time, side * y, at, rises, margin) < _LEFT for side in (-1.0, 1.0))
-    )
-
-
-def _left(
-    time: FloatArray, y: FloatArray, at: IntArray, rises: np.ndarray, margin: float
-) -> float:
-    """Return the share of the time for which the measurement is at its level before a switch.
-
-    Where it never comes there, the whole stay counts.
-
-    :param time: of the samples [s], shape (n,).
-    :param y: measurement, which has risen where the command rises, shape (n,).
-    :param at: sample of each switch, shape (m,).
-    :param rises: whether the command rises there, shape (m,).
-    :param margin: distance within which the measurement is there [y].
-    """
-    late = 0.0
-    for up in (True, False):
-        ends = 1 + np.flatnonzero(rises[1:] == up)
-        there = y if up else -y
-        level = np.median(there[at[ends]]) - margin
-        for begin, end in zip(at[ends - 1], at[ends], strict=True):
-            # It may have come right after the sample before.
-            come = begin + np.flatnonzero(there[begin + 1 : end + 1] >= level)
-            late += time[end] - time[come[0] if come.size else begin]
-    return float(late / (time[at[-1]] - time[at[0]]))
+    return follow_measurement(record, at, rises)
 
 
 def _settled(record: Record, last: int, changes: _Changes, noise: float) -> FloatArray:

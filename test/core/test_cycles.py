@@ -17,15 +17,18 @@ from hypothesis import strategies as st
 from relay_autotune.errors import RecordError
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.process.response import response
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.cycles import (
     agree,
     cycle_from_samples,
     cycles_of,
     find_cycles,
+    find_relay,
     infer_settings,
     limit_cycle,
 )
-from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
+from relay_autotune.record.record import Cycle, Outcome, PiecewiseConstant, Record, RelaySettings
 
 CYCLE = Cycle(
     index=0,
@@ -59,10 +62,15 @@ def tuned(gain=1.0, ratio=0.7, period=0.01, noise=0.0, baseline=0.0, **parameter
 
 
 def square(levels, stay, lead=(), tail=()):
-    """Return a record whose command stays at each of the levels for a number of samples."""
+    """Return a record whose command stays at each of the levels for a number of samples.
+
+    The measurement rises and falls with them, and switches where it comes to its level.
+    """
     command = np.concatenate((lead, np.repeat(levels, stay), tail)).astype(float)
     time = 0.5 * np.arange(command.size)
-    return Record(time=time, measurement=np.sin(time), command=command)
+    rate = np.where(command > np.mean(levels), 1.0, -1.0)
+    y = np.concatenate(([0.0], np.cumsum(rate[:-1])))
+    return Record(time=time, measurement=y, command=command)
 
 
 # The features of one cycle.
@@ -257,8 +265,23 @@ def test_moments_of_noise_begin_no_cycle():
     # Ends of the long low stays: after 104, 206 and so on.
     command = np.repeat(levels, stays).astype(float)
     time = np.arange(command.size) * 0.1
-    record = Record(time=time, measurement=np.cos(time), command=command)
+    # Rises for 42 or 43 samples, falls for 60 to 62.
+    turns = [0, 43, 103, 144, 205, 247]
+    y = np.interp(np.arange(command.size), turns, [0.0, 1.0] * 3)
+    record = Record(time=time, measurement=y, command=command)
     assert find_cycles(record) == (103, 205)
+
+
+def test_a_square_wave_by_the_clock_is_no_relay():
+    """The process has come to rest long before each switch."""
+    time = np.arange(0.0, 20.0, 0.04)
+    u = PiecewiseConstant(np.arange(1.0, 20.0), np.tile([1.0, -1.0], 10)[:19], 0.0)
+    y = response(TransferFunction.fopdt(7.2, 0.15, 0.01), time, u)
+    y += np.random.default_rng(0).normal(0.0, 0.1, time.size)
+    record = Record(time=time, measurement=y, command=u(time))
+    assert find_relay(record) is not None
+    assert find_cycles(record) == cycles_of(record) == ()
+    assert infer_settings(record) is None
 
 
 @pytest.mark.parametrize(
