@@ -36,6 +36,7 @@ from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
 from relay_autotune.exchange.export import EXPORTS, WITHOUT_LAW, Target, exported
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import ONLY_JOINT
+from relay_autotune.loop.gains import Gains
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import declared
 from relay_autotune.record.excitation import resting_command
@@ -124,7 +125,8 @@ def replay(
     try:
         analyses = analysed(job, said, progress, tell)
         if job.export is not None:
-            text = _exported(analyses, *job.export, accept_doubtful=job.accept_doubtful)
+            gains, text = _exported(analyses, *job.export, accept_doubtful=job.accept_doubtful)
+            said += [f"{job.name}: {warning}" for warning in gains.warnings]
             return Done(job.name, status_of(analyses), tuple(said), text), analyses
     except SelectionError as error:
         command = shlex.join(("replay", *job.paths))
@@ -182,8 +184,8 @@ def analysed(
 
 def _exported(
     analyses: Sequence[Analysis], how: str, target: Target, *, accept_doubtful: bool
-) -> str:
-    """Return the gains as a file; there must be those of one experiment alone."""
+) -> tuple[Gains, str]:
+    """Return gains, and them as a file; there must be those of one experiment alone."""
     found = [a for a in analyses if a.best_gains is not None]
     if not found:
         why = analyses[0].reason if analyses else "there is no experiment"
@@ -200,8 +202,8 @@ def _exported(
             "--accept-doubtful to export them anyway"
         )
     assert only.best_gains is not None
-    to = _from_rest(target, only.record)
-    return exported(only.best_gains, how, to, doubt=only.judgement.reason).rstrip("\n")
+    gains, to = only.best_gains, _from_rest(target, only.record)
+    return gains, exported(gains, how, to, doubt=only.judgement.reason).rstrip("\n")
 
 
 def _from_rest(target: Target, record: Record | None) -> Target:

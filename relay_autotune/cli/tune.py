@@ -548,6 +548,8 @@ def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
     found = _Designs(task, rule, options.form, [gains])
     if options.export is not None:
         write(exported(gains, options.export, export_target(options)), options.output)
+        for warning in gains.warnings:
+            say(PROGRAM, warning)
     elif options.json:
         print(to_json(found.document(every=False)), flush=True)
     else:

@@ -162,10 +162,10 @@ def settings(gains: Gains, law: Law, target: Target) -> str:
         low, high = (f"{limit:g}" if math.isfinite(limit) else "none" for limit in limits)
         set_there = f"; set them to {low} and {high}" if any(map(math.isfinite, limits)) else ""
         where = f"Limits of the command are set in the program{set_there}. "
+    of_command = "" if law.command == "any" else f" Its command is the {law.command}."
     told: tuple[str, ...] = (
-        f"For {law.program}.",
-        f"Command: {law.command}.",
-        f"{where}At {'them' if where else 'the limits of the command'}: {law.limits}.",
+        f"For {law.program}.{of_command}",
+        f"{where}At the limits of the command: {law.limits}.",
     )
     if law.sign:
         sign = law.sign.format(sign="positive" if gains.kc < 0.0 else "negative")
@@ -314,15 +314,8 @@ def _comments(gains: Gains, more: Sequence[str], remark: str, *, known: bool = F
     if gains.law:
         told.append(f"Designed for {gains.law} every {gains.law_period:.6g} s.")
         if not known:
-            told.append(
-                "That is --sample-period, else the interval of the recording: give "
-                "--sample-period if the program runs at another."
-            )
-        if gains.law != OWN_LAW and not known:
-            told.append(
-                f"controller_node proves them where its parameter law is {gains.law}; another "
-                f"proof of it was of other gains."
-            )
+            told[-1] += " If it runs at another period, export again with --sample-period."
+    told += gains.warnings
     return [f"{remark} {line}" for line in (*told, *more)]
 
 

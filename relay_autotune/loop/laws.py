@@ -607,7 +607,7 @@ def _control_toolbox(
 
 _BACK_CALCULATION = _control_toolbox(
     "control_toolbox_back_calculation",
-    "I also gets h (u limited - u)/tracking_time_constant",
+    "the integral also gets h (u limited - u)/tracking_time_constant",
     # That which control_toolbox takes for 0; written out, since a program that runs keeps the one
     # of the gains before.
     Setting("tracking_time_constant", lambda law: law.gains.tracking or None),
@@ -637,7 +637,7 @@ _ROWS = (
     _control_toolbox("control_toolbox_none", "the integral winds up"),
     _control_toolbox(
         "control_toolbox_legacy",
-        "I stays between i_clamp_min and i_clamp_max",
+        "the integral stays between i_clamp_min and i_clamp_max",
         equation=_EARLY,
         integral=Integral.BEFORE,
     ),
@@ -651,7 +651,7 @@ _ROWS = (
         "arduino_pid_v1",
         "PID_v1 of br3ttb/Arduino-PID-Library, 1.2.1",
         f"{_ON_Y}; b is 1, with P_ON_M 0",
-        "I stays within the output limits",
+        "the integral stays within the output limits",
         (
             # Their sign is that of ControllerDirection.
             *_gains("Kp Ki Kd", of=abs),
@@ -687,7 +687,7 @@ void startController() {
         "simple_pid",
         "simple-pid of m-lundberg, 2.0.1",
         f"{_ON_Y}; b is 1, with proportional_on_measurement 0",
-        "I stays within output_limits",
+        "the integral stays within output_limits",
         (
             *_gains("Kp Ki Kd"),
             Setting("sample_time", lambda law: law.period),
@@ -706,7 +706,7 @@ void startController() {
         "the PID climate of ESPHome, 2024.11.0-dev",
         "I_k = I_{k-1} + i h e_k, then u_k = p e_k + I_k - d (y_k - y_{k-N})/(N h), "
         "N = derivative_averaging_samples; without deadband, output_averaging_samples 1",
-        "I stays between min_integral and max_integral",
+        "the integral stays between min_integral and max_integral",
         (
             *_gains("kp ki kd"),
             Setting(
@@ -747,7 +747,7 @@ void startController() {
         "PID_t of Marlin's temperature.h, commit 000b34772776",
         "I_k = I_{k-1} + e_k, then u_k = (Kp e_k + Ki h I_k - Kd s_k)/255; s_k = K1 s_{k-1} + "
         "(1 - K1) (y_k - y_{k-1})/h, K1 = PID_K1; within PID_FUNCTIONAL_RANGE",
-        "Ki h I stays between 0 and the largest output",
+        "the integral, Ki h I, stays between 0 and the largest output",
         (
             *_gains("DEFAULT_Kp DEFAULT_Ki DEFAULT_Kd", of=_of_255),
             Setting(
@@ -769,7 +769,7 @@ void startController() {
         "RateControl of PX4, rate_control.cpp of commit 0155b3a86295, for small errors; its D "
         "acts on an acceleration that another module filters, and is left at 0",
         "u_k = p e_k + I_k, then I_{k+1} = I_k + i h e_k",
-        "no integration further into the limit of the allocator; I within its own limit",
+        "no integration further into the limit of the allocator; the integral within its limit",
         _gains("MC_ROLLRATE_P MC_ROLLRATE_I MC_ROLLRATE_D"),
         integral=Integral.AFTER,
         slope=Slope.NONE,
@@ -782,7 +782,7 @@ void startController() {
         "AC_PID::update_all of ArduPilot, commit 00e79c1a8aca, with FLTT, FLTE, SMAX and FF at 0",
         "s_k = s_{k-1} + a ((e_k - e_{k-1})/h - s_{k-1}), a = h/(h + 1/(2 pi FLTD)); "
         "I_k = I_{k-1} + i h e_k, then u_k = p e_k + I_k + d s_k",
-        "I may only shrink while the limit flag is set; I within IMAX",
+        "the integral may only shrink while the limit flag is set; the integral within IMAX",
         (
             *_gains("ATC_RAT_RLL_P ATC_RAT_RLL_I ATC_RAT_RLL_D"),
             Setting(
@@ -808,7 +808,7 @@ void startController() {
         "the example PID of IEC 61131-3, final draft of the 2nd edition (2001)",
         "its error is y - r: X_k = X_{k-1} + h (y_k - r_k), then u_k = KP (E_k + X_k/TR + TD "
         "(3 (E_k - E_{k-3}) + E_{k-1} - E_{k-2})/(10 h)), E = y - r",
-        "none: the integral winds up",
+        "the integral winds up",
         (
             Setting("KP", lambda law: -law.gains.kc),
             *_gains("TR TD", "ti td"),
@@ -833,7 +833,7 @@ void startController() {
         "oscat_ft_pid",
         "FT_PID 2.1 of OSCAT BASIC 3.33, with the error as IN",
         "u_k = KP (e_k + I_k + TV (e_k - e_{k-1})/h), I_k = I_{k-1} + h (e_k + e_{k-1})/(2 TN)",
-        "I stays between ILIM_L and ILIM_H",
+        "the integral stays between ILIM_L and ILIM_H",
         _gains("KP TN TV", "kc ti td"),
         integral=Integral.TRAPEZOID,
         slope=Slope.ERROR,

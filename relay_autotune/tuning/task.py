@@ -245,7 +245,10 @@ def cost_of(law: SampledLaw, found: Performance, own: Performance | None) -> tup
         )
     if not costs:
         return ()
-    return (f"{name} costs, beside {OWN_LAW}: {', '.join(costs)}; {_lacking(law)}",)
+    return (
+        f"{name} does worse than a controller with filter and set-point weight, {OWN_LAW}: "
+        f"{', '.join(costs)}; {_lacking(law)}",
+    )
 
 
 def _lacking(law: SampledLaw) -> str:
