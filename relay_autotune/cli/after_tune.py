@@ -24,7 +24,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from relay_autotune.cli.apply_gains import beside, found_entries
+from relay_autotune.cli.apply_gains import found_entries
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, as_typed, exit_status, say
 from relay_autotune.cli.loops import PATIENCE, Loop, Steps
 from relay_autotune.cli.own_nodes import (
@@ -35,6 +35,7 @@ from relay_autotune.cli.own_nodes import (
     ranges,
     ros_arguments,
 )
+from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import (
     StatusLine,
     Working,
@@ -291,7 +292,7 @@ class AfterTune:
             return
         if (present := loop.present()) is not None:
             model = transfer_function_from_message(result.transfer_function)
-            print("\n" + "\n".join(beside(present, self.gains, model)), flush=True)
+            print("\n" + "\n".join(beside(present, self.gains, model, width())), flush=True)
 
     def _nothing_started(self) -> int:
         """Print the result of a dry run, or why the node refuses."""

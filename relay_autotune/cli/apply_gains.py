@@ -24,45 +24,34 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded_in_graph, say
+from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import (
     Help,
     StatusLine,
     Working,
     agreed_step,
     agrees,
-    in_columns,
     noted,
     tell,
     width,
     write,
 )
-from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, TuningError
+from relay_autotune.errors import LoopError, ParameterError, TuningError
 from relay_autotune.exchange.messages import reason_from_message
 from relay_autotune.reasons import Code
 from relay_autotune.text import digits, duration
 
 if TYPE_CHECKING:
-    from relay_autotune.loop.gains import Controller, Gains, Performance
+    from relay_autotune.loop.gains import Controller
     from relay_autotune.nodes.gains_client import GainsClient
     from relay_autotune.nodes.loop_client import LoopClient
-    from relay_autotune.process.transfer_function import TransferFunction
 
 PROGRAM = "apply_gains"
 
-_FIGURES = (
-    ("kc", "u/y"), ("ti", "s"), ("td", "s"), ("tf", "s"), ("b", ""),
-)  # fmt: skip
 # An uncertainty of the overshoot that is worth showing, as a fraction of the step.
 _SEEN = 0.03
 # How long to look for the controller_node [s].
 _FOUND_WITHIN = 5.0
-# What a loop does, by the fields of `Performance`.
-_EFFECTS = (
-    ("Ms", "ms", ""),
-    ("error after a load step", "iae_load", "y s/u"),
-    ("overshoot", "overshoot", ""),
-    ("settling time", "settling_time", "s"),
-)
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -184,7 +173,7 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
         _require_trust(doubt, options)
         if client.has(gains):
             raise TuningError("the new gains are in force already: give --verify-only for a step")
-        print("\n".join(beside(present, gains, model)))
+        print("\n".join(beside(present, gains, model, width())))
     step = 0.0 if options.no_verify else options.step or _usual_step(client, options)
     tried = present if options.verify_only else gains
     if step and tried is not None:
@@ -248,40 +237,6 @@ def _question(options: argparse.Namespace, step: float) -> str:
             f"{joined}?").capitalize()  # fmt: skip
 
 
-def beside(present: Controller | None, gains: Gains, model: TransferFunction) -> list[str]:
-    """Return the gains in force and the new ones, with what each does on the model.
-
-    :param present: the gains in force; None: there are none.
-    :param gains: the new ones.
-    :param model: the process as identified.
-    """
-    now = _performance(present, model)
-    rows = [["", "in force", "new", ""]]
-    for name, unit in _FIGURES:
-        old = "none" if present is None else digits(getattr(present, name))
-        rows.append([name, old, digits(getattr(gains, name)), unit])
-    for label, name, unit in _EFFECTS:
-        told = "-" if present is None else "unstable" if now is None else _number(now, name)
-        rows.append([label, told, _number(gains, name), unit])
-    return in_columns(rows, width())
-
-
-def _number(found: Performance, name: str) -> str:
-    value = getattr(found, name)
-    return f"{100.0 * value:.0f} %" if name == "overshoot" else digits(value, 3)
-
-
-def _performance(present: Controller | None, model: TransferFunction) -> Performance | None:
-    from relay_autotune.loop.analysis import analyse_loop
-
-    if present is None:
-        return None
-    try:
-        return analyse_loop(present, model)
-    except RelayAutotuneError:
-        return None
-
-
 def verdict_entries(
     result: Any,
     present: Controller | None,
@@ -309,7 +264,7 @@ def verdict_entries(
 def _numbers(gains: Controller | None) -> str:
     if gains is None:
         return "none, the command is held"
-    return ", ".join(f"{n} {digits(getattr(gains, n))}" for n, _ in _FIGURES[:3])
+    return ", ".join(f"{n} {digits(getattr(gains, n))}" for n in ("kc", "ti", "td"))
 
 
 def found_entries(result: Any, noise_std: float = math.nan) -> list[tuple[str, str]]:

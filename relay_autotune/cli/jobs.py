@@ -12,7 +12,7 @@ import argparse
 import os
 import re
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,7 +36,7 @@ from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
 from relay_autotune.exchange.export import EXPORTS, WITHOUT_LAW, Target, exported
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import ONLY_JOINT
-from relay_autotune.loop.gains import Gains
+from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import declared
 from relay_autotune.record.excitation import resting_command
@@ -70,6 +70,7 @@ class Job:
         table tells all of a bag.
     :param export: the kind of file that is wanted instead, and where its gains go; None: none.
     :param accept_doubtful: True: the file may hold gains whose verdict is doubtful.
+    :param present: the gains that the controller has now, to see them beside; None: not known.
     """
 
     name: str
@@ -81,6 +82,7 @@ class Job:
     name_width: int = 0
     export: tuple[str, Target] | None = None
     accept_doubtful: bool = False
+    present: Controller | None = None
 
     @property
     def label(self) -> str:
@@ -219,7 +221,7 @@ def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> s
             return "\n".join(rows(job.label, analyses, why, job.name_width, job.table_width))
         if error is not None:
             return ""
-        return table(job.name, analyses, job.table_width)
+        return table(job.name, analyses, job.table_width, job.present)
     # Imported here, since a table for people does not need it.
     from relay_autotune.exchange.models import document, to_json
 
@@ -374,6 +376,30 @@ def add_analysis(parser: argparse.ArgumentParser) -> None:
     add_quantities(how, declared(Known))
     how.add_argument("--rule", default="robust", help="how to tune (%(default)s)")
     add_design(parser)
+    parser.add_argument(
+        "--present", nargs=3, type=finite, metavar=("KC", "TI", "TD"),
+        help="gains in the controller now, to see them beside the new ones [u/y, s, s]; TI 0: P",
+    )  # fmt: skip
+
+
+def present_of(options: argparse.Namespace, loops: Collection[str]) -> Controller | None:
+    """Return the gains that a controller has now; None: they were not given.
+
+    :param options: with those of :func:`add_analysis`.
+    :param loops: names of all that is analysed.
+    :raises SelectionError: if they cannot be, or of which loop they are is not known.
+    """
+    if options.present is None:
+        return None
+    if len(loops) > 1:
+        raise SelectionError(
+            f"--present is of one loop, and {len(loops)} are given ({', '.join(loops)}): name one"
+        )
+    kc, ti, td = options.present
+    try:
+        return Controller(kc, ti, td)
+    except RelayAutotuneError as error:
+        raise SelectionError(f"--present: {error}") from error
 
 
 def add_times(parser: argparse._ActionsContainer) -> None:
@@ -426,7 +452,7 @@ def jobs_of(
     taken = {each.name: getattr(options, each.name) for each in fields(Selection)}
     names = list(dict.fromkeys(recordings))
     groups = [tuple(names)] if jointly or options.join else [(name,) for name in names]
-    return [
+    jobs = [
         Job(
             name=visible(", ".join(group) + (f" {joint}" if joint else "")),
             paths=group,
@@ -439,6 +465,8 @@ def jobs_of(
         for joint in joints
         if group
     ]
+    present = present_of(options, [job.name for job in jobs])
+    return [replace(job, present=present) for job in jobs]
 
 
 def _check_joints(joints: Sequence[str], order: Sequence[str]) -> None:

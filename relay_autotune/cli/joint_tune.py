@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from relay_autotune.cli.apply_gains import apply_at, beside
+from relay_autotune.cli.apply_gains import apply_at
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say
 from relay_autotune.cli.loops import Loop, Steps
 from relay_autotune.cli.own_nodes import (
@@ -29,7 +29,8 @@ from relay_autotune.cli.own_nodes import (
     ros_arguments,
 )
 from relay_autotune.cli.settings import Answers
-from relay_autotune.cli.terminal import Working, agrees, tell
+from relay_autotune.cli.table import beside
+from relay_autotune.cli.terminal import Working, agrees, tell, width
 from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.export import Target
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
@@ -568,7 +569,7 @@ class JointLoop(Loop):
         model = transfer_function_from_message(found.transfer_function)
         before = client.values(loop.node, list(loop.places.values()))
         wanted = {place: float(getattr(gains, name)) for name, place in loop.places.items()}
-        print("\n".join(beside(self.present(), gains, model)))
+        print("\n".join(beside(self.present(), gains, model, width())))
         question = f"Set {self._places} of {loop.node}, without a step that verifies them?"
         if not agrees(question, yes=self.options.yes):
             say(PROGRAM, "nothing was changed")

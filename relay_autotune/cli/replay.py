@@ -32,7 +32,6 @@ from relay_autotune.cli.jobs import (
     show,
 )
 from relay_autotune.cli.report import (
-    add_present,
     as_asked,
     check_output,
     command_line,
@@ -102,7 +101,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--report", metavar="FILE", help="also write a report: .html, or a .png, .svg or .pdf"
     )
-    add_present(parser)
     parser.add_argument(
         "-o", "--output", metavar="FILE",
         help="write results as they come to a .jsonl, .csv or .parquet file instead; "

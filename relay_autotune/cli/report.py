@@ -23,13 +23,12 @@ from relay_autotune.analysis import PARAMETERS, analyse, task_from
 from relay_autotune.cli.arguments import (
     DONE,
     NOTHING_FOUND,
-    finite,
     flag_of,
     run_command,
     say,
     typed_as,
 )
-from relay_autotune.cli.jobs import Job, add_analysis, analysed, jobs_of
+from relay_autotune.cli.jobs import Job, add_analysis, analysed, jobs_of, present_of
 from relay_autotune.cli.terminal import ProgressLine, Stages
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
 from relay_autotune.loop.gains import Controller
@@ -89,7 +88,6 @@ def _parser() -> argparse.ArgumentParser:
         "--format", choices=("png", "svg"), default="png", help="of these figures (%(default)s)"
     )
     parser.add_argument("--title", metavar="TEXT", default="", help="title of the report")
-    add_present(parser)
     add_analysis(parser)
     return parser
 
@@ -113,7 +111,8 @@ def _run(options: argparse.Namespace) -> int:
         if case.model is None:
             say(PROGRAM, f"{case.source}: nothing identified: {case.reason}")
             status = NOTHING_FOUND
-    write_report(as_asked(cases, options), options.output, title=options.title)
+    cases = as_asked(cases, options)
+    write_report(cases, options.output, title=options.title)
     print(options.output)
     if options.figures:
         try:
@@ -131,17 +130,6 @@ def _announce_figures(folder: str, kind: str) -> None:
         say(PROGRAM, f"{folder} has figures already; those of the same name are replaced")
 
 
-def add_present(parser: argparse.ArgumentParser) -> None:
-    """Add the option for the gains that a report compares with the new ones.
-
-    :param parser: of the command.
-    """
-    parser.add_argument(
-        "--present", nargs=3, type=finite, metavar=("KC", "TI", "TD"),
-        help="gains in the controller now, for comparison in the report [u/y, s, s]; TI 0: P",
-    )  # fmt: skip
-
-
 def command_line(program: str, arguments: Sequence[str] | None) -> str:
     """Return a command as it can be typed again.
 
@@ -155,16 +143,11 @@ def as_asked(cases: Sequence[Case], options: argparse.Namespace) -> list[Case]:
     """Return cases with what only the command line knows: present gains, and itself.
 
     :param cases: of the report.
-    :param options: with those of :func:`add_present`, and the command line.
+    :param options: of the command line, and itself.
     :raises SelectionError: if the present gains cannot be.
     """
-    present = None
-    if options.present is not None:
-        kc, ti, td = options.present
-        try:
-            present = Controller(kc, ti, td)
-        except RelayAutotuneError as error:
-            raise SelectionError(f"--present: {error}") from error
+    loops = dict.fromkeys(case.source for case in cases if case.best_gains is not None)
+    present = present_of(options, loops)
     return [replace(case, present=present, command=options.command_line) for case in cases]
 
 

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from relay_autotune.cli.terminal import WIDEST, labelled
+from relay_autotune.cli.terminal import WIDEST, in_columns, labelled
+from relay_autotune.loop.analysis import difference, performance_on
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import limit_cycle
@@ -21,7 +23,7 @@ from relay_autotune.verdict import Judgement, Result, Verdict
 
 if TYPE_CHECKING:
     from relay_autotune.identification.result import Identification, Validation
-    from relay_autotune.loop.gains import Gains, Performance
+    from relay_autotune.loop.gains import Controller, Gains, Performance
     from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.result import Analysis
 
@@ -33,17 +35,28 @@ _Entry = tuple[str, str]
 _BLANK: _Entry = ("", "")
 
 
-def table(bag: str, analyses: Sequence[Analysis], width: int = WIDEST) -> str:
+def table(
+    bag: str,
+    analyses: Sequence[Analysis],
+    width: int = WIDEST,
+    present: Controller | None = None,
+) -> str:
     """Return what was made of each experiment of a recording.
 
     :param bag: the recording, as it was given.
     :param analyses: one for each experiment.
     :param width: columns that a line may have.
+    :param present: the gains that the controller has now; None: not known.
     """
     blocks = [bag]
     for number, analysis in enumerate(analyses, start=1):
         which = f" {number} of {len(analyses)}" if len(analyses) > 1 else ""
         blocks.append("\n".join(_laid_out(_experiment(analysis, which), width)))
+        model, gains = analysis.model, analysis.best_gains
+        if present is not None and model is not None and gains is not None:
+            slower = model.model.dead_time + analysis.added_delay
+            process = replace(model.model, dead_time=slower)
+            blocks.append("\n".join(beside(present, gains, process, width, head="present")))
     return "\n\n".join(blocks) + "\n"
 
 
@@ -114,6 +127,53 @@ def gains_lines(
     rule, isa, *rest = _gains(gains, verdict)
     further = [(f"  {name}", text) for name, text in forms]
     return _laid_out([rule, isa, *further, *rest], width)
+
+
+_FIGURES = (
+    ("kc", "u/y"), ("ti", "s"), ("td", "s"), ("tf", "s"), ("b", ""),
+)  # fmt: skip
+# What a loop does, by the fields of `Performance`.
+_EFFECTS = (
+    ("Ms", "ms", ""),
+    ("error after a load step", "iae_load", "y s/u"),
+    ("overshoot", "overshoot", ""),
+    ("settling time", "settling_time", "s"),
+)
+
+
+def beside(
+    present: Controller | None,
+    gains: Gains,
+    model: TransferFunction,
+    width: int = WIDEST,
+    *,
+    head: str = "in force",
+) -> list[str]:
+    """Return the present gains and the new ones, with what each does on the model.
+
+    :param present: the present gains; None: there are none.
+    :param gains: the new ones.
+    :param model: the process with the dead time of the loop.
+    :param width: columns that a line may have.
+    :param head: what stands above the present gains.
+    """
+    now = None if present is None else performance_on(present, model)
+    rows = [["", head, "new", ""]]
+    for name, unit in _FIGURES:
+        old = "none" if present is None else digits(getattr(present, name))
+        rows.append([name, old, digits(getattr(gains, name)), unit])
+    for label, name, unit in _EFFECTS:
+        told = "-" if present is None else "unstable" if now is None else _number(now, name)
+        rows.append([label, told, _number(gains, name), unit])
+    lines = in_columns(rows, width)
+    if present is not None:
+        lines += labelled("compared", difference(now, gains), width)
+    return lines
+
+
+def _number(found: Performance, name: str) -> str:
+    value = getattr(found, name)
+    return f"{100.0 * value:.0f} %" if name == "overshoot" else digits(value, 3)
 
 
 def _laid_out(entries: Sequence[_Entry], width: int) -> list[str]:

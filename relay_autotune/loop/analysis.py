@@ -411,6 +411,46 @@ def analyse_loop(
     return Loop(controller, model).performance()
 
 
+def performance_on(controller: Controller, model: TransferFunction) -> Performance | None:
+    """Return the performance of gains of any origin on a model; None: the loop is unstable.
+
+    :param controller: the gains.
+    :param model: the process, with all dead time of the loop.
+    """
+    try:
+        return analyse_loop(controller, model)
+    except TuningError:
+        return None
+
+
+# Factors of the error and of Ms that are worth a word.
+_ERROR, _MS = 1.05, 1.02
+
+
+def difference(present: Performance | None, new: Performance) -> str:
+    """Return in words what new gains change.
+
+    :param present: what the present gains do on the model; None: they make the loop unstable.
+    :param new: what the new gains do there.
+    """
+    if present is None:
+        return "the present gains make the loop unstable on the model"
+    error = new.iae_load / present.iae_load if present.iae_load else math.inf
+    calm = -1 if new.ms > _MS * present.ms else int(present.ms > _MS * new.ms)
+    quick = -1 if error > _ERROR else int(error * _ERROR < 1.0)
+    words = (
+        ("less calm", "as calm", "calmer")[calm + 1],
+        "but" if calm * quick < 0 else "and",
+        ("slower", "as fast", "faster")[quick + 1],
+    )
+    told = (
+        f"the new gains are {' '.join(words)}: Ms {new.ms:.3g} instead of {present.ms:.3g}, "
+        f"{error:.2f} times the error after a step of the load"
+    )
+    more = "; where the present loop is calm enough, ask for faster ones with a larger ms"
+    return told + more * (quick < 0 < calm)
+
+
 def ms_on(controller: ControlLaw, model: TransferFunction) -> float:
     """Return Ms of a controller on any model; infinite where the loop is unstable.
 

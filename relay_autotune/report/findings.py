@@ -9,8 +9,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from relay_autotune.errors import TuningError
-from relay_autotune.loop.analysis import analyse_loop
+from relay_autotune.loop.analysis import difference, performance_on
 from relay_autotune.loop.gains import Controller, Performance
 from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import Case, in_loop
@@ -173,6 +172,16 @@ def beside_present(case: Case) -> tuple[Row, ...]:
     )
 
 
+def change_of(case: Case) -> str:
+    """Return what the new gains change, in words; empty: the present ones are not known.
+
+    :param case: the experiment.
+    """
+    if case.best_gains is None or case.present is None:
+        return ""
+    return difference(performance_of(case.present, case), case.best_gains)
+
+
 def performance_of(present: Controller, case: Case) -> Performance | None:
     """Return what the present gains do on the model; None: no model, or an unstable loop.
 
@@ -181,10 +190,7 @@ def performance_of(present: Controller, case: Case) -> Performance | None:
     """
     if case.model is None:
         return None
-    try:
-        return analyse_loop(present, in_loop(case, case.model.found.model))
-    except TuningError:
-        return None
+    return performance_on(present, in_loop(case, case.model.found.model))
 
 
 def compared_numbers(gains: Controller, does: Performance | None) -> list[tuple[str, str, str]]:
@@ -213,6 +219,8 @@ def compared_numbers(gains: Controller, does: Performance | None) -> list[tuple[
             digits(does.iae_load, 3),
             "the smaller, the faster a load is compensated",
         ),
+        ("overshoot [%]", digits(100.0 * does.overshoot, 3), "after a step of the set-point"),
+        ("settles in [s]", digits(does.settling_time, 3), "after a step of the set-point"),
     ]
 
 

@@ -20,6 +20,7 @@ from relay_autotune.report.figures import PLATES, Plate
 from relay_autotune.report.findings import (
     Chip,
     beside_present,
+    change_of,
     checks_of,
     doubts_of,
     facts_of,
@@ -117,7 +118,10 @@ def _environment() -> Environment:
         "mathml": lambda model: Markup(process_mathml(model)),
     }
     # What the page says of a case, each by the function that finds the words.
-    said = (steps_of, beside_present, warnings_of, checks_of, numbers_of, doubts_of, repeats_of)
+    said = (
+        *(steps_of, beside_present, change_of, warnings_of, checks_of, numbers_of),
+        *(doubts_of, repeats_of),
+    )
     environment.globals |= {function.__name__: function for function in said}
     return environment
 

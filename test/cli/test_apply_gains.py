@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 
 from relay_autotune.cli import apply_gains
-from relay_autotune.cli.apply_gains import beside, found_entries, verdict_entries
+from relay_autotune.cli.apply_gains import found_entries, verdict_entries
+from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import labelled
 from relay_autotune.cli.tune_page import GainsPage
 from relay_autotune.control.verification import StepRange
@@ -66,7 +67,8 @@ def test_old_and_new_gains_stand_side_by_side_with_what_they_do() -> None:
 def test_gains_that_are_missing_or_unstable_are_told_as_such() -> None:
     assert "none" in "\n".join(beside(None, GAINS, MODEL))
     wild = "\n".join(beside(Controller(50.0, 0.1), GAINS, MODEL))
-    assert wild.count("unstable") == 4
+    assert wild.count("unstable") == 5
+    assert "the present gains make the loop unstable on the model" in wild
 
 
 def test_a_verdict_has_five_lines() -> None:

@@ -5,6 +5,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from analysed import completed
@@ -12,6 +16,8 @@ from report_cases import fruitless, only
 
 from relay_autotune.cli import replay, report
 from relay_autotune.exchange.models import document, to_json
+from relay_autotune.loop.analysis import analyse_loop
+from relay_autotune.loop.gains import Controller
 from relay_autotune.report import figures
 
 
@@ -180,5 +186,32 @@ def test_present_gains_and_the_command_are_in_the_report(
     text = page.read_text()
     assert "Beside the present gains" in text
     assert f"report {result} -o {page} --present 0.3 20 0" in text
+    drawn: list[Any] = []
+    monkeypatch.setattr(report, "write_figures", lambda cases, *_: drawn.extend(cases) or [])
+    given = ("--present", "0.3", "20", "0")
+    run(capsys, result, "-o", page, "--figures", tmp_path / "figures", *given)
+    assert drawn[0].present == Controller(0.3, 20.0)
     status, _, err = run(capsys, result, "-o", page, "--present", "0", "20", "0")
     assert (status, "--present" in err) == (2, True)
+
+
+def test_the_table_has_the_present_gains_beside_the_new_ones(
+    capsys, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr("relay_autotune.cli.jobs.analyse", lambda record, **_: completed())
+    logs = [str(tmp_path / name) for name in ("a.csv", "b.csv")]
+    for log in logs:
+        write_csv(Path(log))
+    present = ("--present", "0.3", "20", "0")
+    assert replay.main([logs[0], *present]) == 0
+    told = capsys.readouterr().out
+    found, model = completed(), completed().model.model
+    slower = replace(model, dead_time=model.dead_time + found.added_delay)
+    expected = analyse_loop(Controller(0.3, 20.0), slower)
+    row = next(line.split() for line in told.splitlines() if line.startswith("  Ms  "))
+    assert [float(n) for n in row[1:]] == pytest.approx(
+        [expected.ms, found.best_gains.ms], rel=0.01
+    )
+    assert "the new gains are " in told
+    assert replay.main([*logs, *present]) == 2
+    assert "--present is of one loop, and 2 are given" in capsys.readouterr().err

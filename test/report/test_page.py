@@ -19,7 +19,7 @@ from report_cases import aborted, fruitless, only
 from relay_autotune.exchange.models import document, model_fields, to_json
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Combination, Rival, identified
-from relay_autotune.loop.analysis import analyse_loop
+from relay_autotune.loop.analysis import analyse_loop, difference
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.structures import (
     FOPDT,
@@ -45,7 +45,7 @@ from relay_autotune.report.case import (
     true_value,
 )
 from relay_autotune.report.figures import PLATES
-from relay_autotune.report.findings import beside_present
+from relay_autotune.report.findings import beside_present, change_of
 from relay_autotune.report.page import page
 from relay_autotune.report.style import COLOURS
 
@@ -356,6 +356,24 @@ def test_the_present_gains_stand_beside_the_new_ones_with_what_both_do(monkeypat
     assert "Beside the present gains" in read(page([replace(case, present=weak)])).text
     wild = replace(case, present=Controller(10.0 * case.best_gains.kc, 1.0))
     assert "unstable" in beside_present(wild)[-1].meaning
+    assert "loop unstable" in change_of(wild)
+    assert float(rows["overshoot [%]"].present) == pytest.approx(100.0 * expected.overshoot, 0.01)
+    assert float(rows["settles in [s]"].new) == pytest.approx(case.best_gains.settling_time, 0.01)
+
+
+def test_what_new_gains_change_is_said_in_words() -> None:
+    new = completed().best_gains
+    for ms, iae, words in (
+        (1.5, 0.5, "calmer but slower"),
+        (1.5, 2.0, "calmer and faster"),
+        (0.9, 2.0, "less calm but faster"),
+        (1.0, 1.0, "as calm and as fast"),
+    ):
+        present = replace(new, ms=ms * new.ms, iae_load=iae * new.iae_load)
+        told = difference(present, new)
+        assert told.startswith(f"the new gains are {words}: Ms {new.ms:.3g} instead of ")
+        assert f", {1.0 / iae:.2f} times the error" in told
+        assert ("ask for faster ones" in told) == (words == "calmer but slower")
 
 
 def test_it_says_how_to_repeat_the_report_and_the_test(monkeypatch) -> None:
