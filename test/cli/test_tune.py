@@ -9,6 +9,7 @@ import io
 import json
 import math
 import re
+from pathlib import Path
 
 import pytest
 import yaml
@@ -235,7 +236,11 @@ def test_exports(capsys, tmp_path):
     _, out, _ = run(capsys, FOPDT, asked, "yaml")
     assert yaml.safe_load(out)["ti"] == 25.0
     path = str(tmp_path / "gains.yaml")
-    assert run(capsys, FOPDT, asked, "yaml --output", path) == (0, "", "")
+    status, out, err = run(capsys, FOPDT, asked, "yaml --output", path)
+    assert (status, out) == (0, "")
+    # What the user must know stands in the file and beside it.
+    assert err.startswith("tune: Ms is 1.95, above the 1.4 asked for")
+    assert f"# {err.removeprefix('tune: ')}" in Path(path).read_text()
     status, _, err = run(capsys, FOPDT, asked, "yaml --output", path)
     assert status == 2
     assert "not overwriting" in err
