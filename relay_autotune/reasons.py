@@ -472,11 +472,11 @@ class Code(enum.IntEnum):
     # Between two nodes: at the start, and while a tune runs.
     SECOND_PUBLISHER = _Row(
         250,
-        "{topic} is also published by {others}: two of them would fight for the actuator[; "
-        "{remap}]",
+        "{topic} is also published by {others}: two of them would fight for the actuator",
+        "end that one for the tune, or let it command through relay_node",
     )
-    """A second node commands: stop it, or connect it to controller_command. One that was killed
-    is forgotten after about 20 s."""
+    """A second node commands: stop it, connect it to controller_command, or give path takeover.
+    One that was killed is forgotten after about 20 s."""
     SECOND_SOURCE = _Row(
         251,
         "{topic} is published by {count} publishers, {others}, expected one: the relay would act "

@@ -26,6 +26,7 @@ from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError,
 from relay_autotune.exchange.export import Target
 from relay_autotune.exchange.messages import reason_from_message
 from relay_autotune.reasons import Code, Reason
+from relay_autotune.text import in_units
 
 if TYPE_CHECKING:
     from relay_autotune.loop.gains import Controller
@@ -79,6 +80,12 @@ class Loop:
             return found if all(map(math.isfinite, found)) else ()
         return ()
 
+    def hand_over(self) -> None:
+        """Leave the command to relay_node alone, once that is there.
+
+        :raises LoopError: if somebody else commands.
+        """
+
     def plan(self) -> list[str]:
         """Return what the loop itself has to say of a tune, as lines of a checklist."""
         return []
@@ -112,7 +119,14 @@ class Loop:
 
     def left(self) -> str:
         """Return in which state a tune without gains has left the plant; empty: not known."""
-        return ""
+        others = self.other_commander()
+        return others and f"the safe command was sent, but {others} commands, too, and goes on"
+
+    def other_commander(self) -> str:
+        """Return who else commanded during a tune that ended for that; empty: nobody."""
+        why = reason_from_message(self.client.result.why)
+        of_others = Code.SECOND_PUBLISHER, Code.FOREIGN_COMMAND
+        return str(why.values.get("others", "another node")) if why.code in of_others else ""
 
     def instead(self) -> str:
         """Return what to do in place of the same tune again; empty: it may be repeated."""
@@ -160,7 +174,7 @@ class TopicLoop(Loop):
 
     def __init__(self, client: TuneClient, options: argparse.Namespace) -> None:
         # Imported here, because it needs ROS.
-        from relay_autotune.nodes.live_types import unit_of_field
+        from relay_autotune.nodes.live_types import CommandMessage, unit_of_field
 
         super().__init__(client, options)
         answers, measurement, command = self.answers, options.measurement, options.command
@@ -171,11 +185,11 @@ class TopicLoop(Loop):
         self._choose_field()
         self._command_field = options.command_field or "data"
         try:
-            with Working(f"listening to {measurement} and {command}"):
+            with Working(f"listening to {measurement}"):
                 answers.measured = client.measured(measurement, self._kind, options.field)
-                answers.commanded = client.commanded(
-                    command, self._command_kind, self._command_field, options.command_message or ""
-                )
+            self._commands = CommandMessage(
+                self._command_kind, self._command_field, options.command_message or ""
+            )
         except ParameterError as error:
             raise SelectionError(as_flags(str(error))) from None
         for letter, kind, field in (
@@ -184,12 +198,15 @@ class TopicLoop(Loop):
         ):
             if unit := unit_of_field(kind, field):
                 UNITS[letter] = unit
+        with Working(f"looking who commands {command}"):
+            self._require_alone()
+        self._give_up = client.claim(self._commands.kind, command)
         needed = [name for name in self.form[:3] if answers[name] is None]
         if options.web:
             return
         if sys.stdin.isatty() and needed and len(UNITS) < 2:
             print("u is the command's unit, y the measurement's", file=sys.stderr)
-        answers.ask("at", known=answers.commanded)
+        answers.ask("at")
         answers.ask("within")
         if answers["command_within"] is not None or not options.amplitude:
             # The amplitude is found between these.
@@ -225,6 +242,30 @@ class TopicLoop(Loop):
         """The name of the loop for people."""
         return f"{self.options.measurement} -> {self.options.command}"
 
+    def hand_over(self) -> None:
+        """Leave the command to relay_node alone, once that is there.
+
+        :raises LoopError: if somebody else commands.
+        """
+        self._require_alone()
+        self._give_up()
+
+    def _require_alone(self) -> None:
+        """Refuse a loop that somebody else commands, with its name and what to do."""
+        topic = self.options.command
+        if not (others := self.client.others_on(topic)):
+            return
+        present = self.client.commanded(topic, self._commands)
+        says, at = "", ""
+        if not math.isnan(present):
+            says = f", {present:.6g} u now"
+            at = f" with --at {present:.6g}, while the process still rests there"
+        told = (
+            f"{others} commands {topic}{says}: end it first (Ctrl-C where it runs; one that was "
+            f"killed is forgotten after some 20 s), then start again{at}"
+        )
+        raise LoopError(in_units(told, UNITS))
+
     def arguments(self) -> dict[str, list[str]]:
         """Return the arguments for ROS of its nodes, by the names of their executables."""
         options, space = self.options, own_namespace(self.options)
@@ -259,6 +300,8 @@ class TopicLoop(Loop):
     def left(self) -> str:
         """Return at which command the loop is left, and whether that is the right one."""
         command = self.options.at
+        if told := super().left():
+            return told
         if self._rests_elsewhere:
             return (
                 f"the command stands at {command:.6g} u, which is not the one at which the "
@@ -268,6 +311,17 @@ class TopicLoop(Loop):
         if self.left_its_limits:
             told += ": look whether the process rests there, else set the right one now"
         return told
+
+    def other_commander(self) -> str:
+        """Return who else commanded during a tune that ended for that; empty: nobody."""
+        # Its name may have become known since.
+        found = super().other_commander()
+        return found and (self.client.others_on(self.options.command) or found)
+
+    def first(self) -> Steps:
+        """Return what has to be done before the same tune again."""
+        others = self.other_commander()
+        return [("first", f"end {others}, which commands {self.options.command}")] * bool(others)
 
     def instead(self) -> str:
         """Return what to do in place of the same tune, which would drive the process away."""

@@ -158,12 +158,10 @@ class Answers:
 
     :param options: as the command line gives them; answers are kept there, too.
     :param measured: the present measurement [y]; NaN: not known.
-    :param commanded: the present command, if somebody publishes one [u]; NaN: nobody does.
     """
 
     options: argparse.Namespace
     measured: float = math.nan
-    commanded: float = math.nan
     _from: dict[str, str] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Any:
@@ -202,13 +200,9 @@ class Answers:
         """Return what is seen of a setting's quantity now; empty: nothing."""
         if name == "amplitude":
             return ""
-        value = self.measured if name == "within" else self._present_command
-        return "" if math.isnan(value) else f"{value:.4g} {SETTING[name].unit} now"
-
-    @property
-    def _present_command(self) -> float:
-        at = self["at"]
-        return self.commanded if at is None else float(at)
+        value = self.measured if name == "within" else self["at"]
+        unknown = value is None or math.isnan(value)
+        return "" if unknown else f"{value:.4g} {SETTING[name].unit} now"
 
     def why_impossible(self, name: str, value: Any) -> str:
         """Return why a value cannot be, as far as is known now; empty: it can.
@@ -219,7 +213,7 @@ class Answers:
         if name == "within":
             seen, what = self.measured, "the measurement is {} now"
         elif name == "command_within":
-            seen, what = self._present_command, "the present command is {}"
+            seen, what = self["at"], "the present command is {}"
         elif name == "at" and (limits := self["command_within"]):
             low, high = limits
             told = f"expected a command from {low:g} to {high:g}, the limits of the actuator"
@@ -229,24 +223,21 @@ class Answers:
         else:
             return ""
         low, high = value
-        fine = math.isnan(seen) or low <= seen <= high
+        fine = seen is None or math.isnan(seen) or low <= seen <= high
         return "" if fine else f"{what.format(f'{seen:.6g}')}: give limits around it"
 
-    def ask(self, name: str, what: str = "", example: str = "", known: float = math.nan) -> None:
+    def ask(self, name: str, what: str = "", example: str = "") -> None:
         """Ask for a value that is not known yet, and refuse one that cannot be.
 
         :param name: of the setting.
         :param what: how it is asked for; empty: as its row says.
         :param example: what may be typed; empty: as its row says.
-        :param known: what Enter takes; NaN: nothing.
         """
         setting = SETTING[name]
         if self[name] is not None:
             self.take({name: self[name]}, self.source(name))
             return
-        shown = "" if math.isnan(known) else f"{known:.6g}"
-        example = example or shown or setting.example
-        seen = "" if shown else self.now(name)
+        example, seen = example or setting.example, self.now(name)
         question = f"{what or setting.question} [{SETTING[name].unit}]" + f", {seen}" * bool(seen)
 
         def read(text: str) -> Any:
@@ -255,7 +246,7 @@ class Answers:
             return setting.read(text)
 
         value = asked(
-            question, flag_of(setting), shown, example, read,
+            question, flag_of(setting), "", example, read,
             lambda found: self.why_impossible(name, found), pair=setting.ends > 1,
         )  # fmt: skip
         self.take({name: value}, "typed")
@@ -267,8 +258,6 @@ class Answers:
         """
         for name in names:
             setting, value = SETTING[name], self[name]
-            if value is None and name == "at" and not math.isnan(self.commanded):
-                value = float(f"{self.commanded:.6g}")
             yield {
                 "name": name,
                 "question": setting.question,

@@ -205,6 +205,8 @@ class Session:
         loops = self._looked_at(kind)
         patience = self._started(loops)
         self._find(loops, patience)
+        for each in loops:
+            each.hand_over()
         deadline = time.monotonic() + min(patience, _READY_WITHIN)
         loop = loops[0]
         print("".join(f"{line}\n" for line in check_lines(loop.plan(), width())), end="",

@@ -31,6 +31,9 @@ from relay_autotune.nodes.live_types import CommandMessage, reader_of
 
 # How long present commands are listened to [s].
 _LISTEN = 1.0
+# A node that was there before may be unknown until it next announces itself [s]: Fast DDS does so
+# every 3 s, and its publishers are told within some 0.1 s.
+_ALL_KNOWN_AFTER = 3.5
 # How long a node may take to answer [s], and after which time one may be asked again.
 ANSWER_WITHIN, _ASK_AGAIN = 10.0, 3.0
 # Messages of a latched topic from before the subscription that are taken.
@@ -117,6 +120,7 @@ class LoopClient:
             self._node = beside._node
         # That of the client which has the executor.
         self._first: Node = beside._first if beside else self._node
+        self._joined = time.monotonic()
         self.name = self._node.resolve_service_name(node)
         self._services: dict[str, Any] = {}
 
@@ -385,21 +389,44 @@ class LoopClient:
                 f"and identifier_node yourself, and leave out --measurement and --command"
             )
 
-    def commanded(self, topic: str, type_name: str, field: str, others: str) -> float:
+    def others_on(self, topic: str) -> str:
+        """Return the names of the nodes that publish a topic, but this and the one called most.
+
+        Whoever was there before this client is among them.
+
+        :param topic: its name.
+        :return: empty: there are none.
+        """
+        name = self._resolved(topic)
+        own = {self.name, self._node.get_fully_qualified_name()}
+
+        def found() -> list[str]:
+            ends = self._node.get_publishers_info_by_topic(name)
+            return sorted({quality.who(end) for end in ends} - own)
+
+        self.rest(self._joined + _ALL_KNOWN_AFTER - time.monotonic())
+        # A publisher is told before the name of its node.
+        self.wait(lambda: quality.UNNAMED not in found(), _LISTEN)
+        return " and ".join(found())
+
+    def claim(self, kind: Any, topic: str) -> Callable[[], object]:
+        """Show to others that this client is about to command, and return what ends that.
+
+        :param kind: the message class.
+        :param topic: name of the command's topic.
+        """
+        mouth = self._node.create_publisher(kind, self._resolved(topic), quality.COMMAND)
+        return lambda: self._node.destroy_publisher(mouth)
+
+    def commanded(self, topic: str, commands: CommandMessage) -> float:
         """Return the mean of the commands that are published now; NaN: none are.
 
         :param topic: name of the command's topic.
-        :param type_name: its message type.
-        :param field: path of the command in its messages.
-        :param others: what stands in their other elements, as for `CommandMessage`.
-        :raises ParameterError: if the messages of this type do not have such a command.
+        :param commands: reads its messages.
         """
-        commands = CommandMessage(type_name, field, others)
-        name = self._resolved(topic)
-        if not self._node.count_publishers(name):
-            return math.nan
         heard: list[float] = []
-        with self._hearing(commands.kind, name, readable(commands.value, heard.append)):
+        hear = readable(commands.value, heard.append)
+        with self._hearing(commands.kind, self._resolved(topic), hear):
             self.rest(_LISTEN)
         return sum(heard) / len(heard) if heard else math.nan
 

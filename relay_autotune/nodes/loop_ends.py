@@ -38,7 +38,6 @@ REPEAT_SAFE = Duration(seconds=0.01)
 REPEATS = 15
 # Number of latched cycles for late subscribers; max_cycles at the node's start if that is more.
 CYCLES_KEPT = 100
-_REMAP = "remap the controller's output to controller_command, or give path takeover"
 
 
 class CommandPublisher:
@@ -348,9 +347,8 @@ class LoopSupervisor:
             if self._driven and self.handover.age <= self._value("controller_timeout"):
                 raise NotReadyError(Code.BUSY_COMMAND(topic=self._topic))
             return
-        problem = watch.second_publisher(self._node, self._topic)
-        if problem is not None:
-            raise NotReadyError(problem.plus(remap=_REMAP))
+        if problem := watch.second_publisher(self._node, self._topic):
+            raise NotReadyError(problem)
 
     def _several(self) -> Reason | None:
         """Return a reason if there is a second sensor, controller or relay_node."""

@@ -194,11 +194,14 @@ def nearest(
     return there[0], f" (others: {', '.join(there[1:_MOST_NAMED])})" if there[1:] else ""
 
 
+UNNAMED = "a node not known yet"
+"""Stands for the name of a node that the middleware has not told yet."""
+
+
 def who(end: Any) -> str:
     """Return the full name of the node of a publisher or subscription."""
-    # The middleware's word for a participant whose nodes have not been told yet.
     if end.node_name == "_NODE_NAME_UNKNOWN_":
-        return "a node not known yet"
+        return UNNAMED
     return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
 
 

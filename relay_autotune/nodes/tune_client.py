@@ -204,7 +204,7 @@ class TuneClient(LoopClient):
         )
 
     def _is_own(self, reason: Reason) -> bool:
-        """Return whether a second publisher is this client's node, which has held a joint.
+        """Return whether a second publisher is this client's own, of before the tune.
 
         It is known for a while after its end.
         """

@@ -159,19 +159,30 @@ def test_a_file_that_exists_is_noticed_before_anything_is_looked_at(tmp_path, ca
 class Looker:
     """A client of a loop whose topics have these types, with a present command."""
 
+    takes = "std_msgs/msg/Float64"
+
     def __init__(
         self,
         present: float = math.nan,
         kind: str = "std_msgs/msg/Float32",
         measures: float = math.nan,
+        others: str = "",
     ) -> None:
         self.present, self.kind, self.measures = present, kind, measures
+        self.others = others
 
     def kind_of(self, topic: str, patience: float, *, published: bool) -> str:
-        return self.kind if topic == "/tank/level" else "std_msgs/msg/Float64"
+        return self.kind if topic == "/tank/level" else self.takes
 
-    def commanded(self, topic: str, type_name: str, field: str, others: str) -> float:
+    def commanded(self, topic: str, commands: Any) -> float:
         return self.present
+
+    def others_on(self, topic: str) -> str:
+        return self.others
+
+    def claim(self, kind: Any, topic: str) -> Callable[[], object]:
+        self.claims = True
+        return lambda: setattr(self, "claims", False)
 
     def measured(self, topic: str, type_name: str, field: str) -> float:
         return self.measures
@@ -247,9 +258,52 @@ def test_what_is_not_given_is_asked_for_until_it_can_be_read(typed: list[str]) -
     assert (found["command_min"], found["command_max"]) == ("0.0", "5.0")
 
 
-def test_the_command_that_is_heard_needs_only_enter(typed: list[str]) -> None:
-    typed += ["", "0 5"]
-    assert arguments(Looker(present=2.25), options("--within", "1", "9"))["baseline"] == "2.25"
+def test_a_loop_that_somebody_else_commands_is_refused_before_any_question(
+    typed: list[str],
+) -> None:
+    told = "/pid commands /tank/valve, 2.25 u now: end it first .* with --at 2.25, while"
+    with pytest.raises(LoopError, match=told):
+        TopicLoop(Looker(present=2.25, others="/pid"), options())
+    with pytest.raises(LoopError, match=r"/gui commands /tank/valve: .* start again$"):
+        TopicLoop(Looker(others="/gui"), options())
+    # A second tune_loop sees the first before its relay_node is there.
+    loop = TopicLoop(client := Looker(), options("--web"))
+    assert client.claims
+    client.others = "/pid"
+    with pytest.raises(LoopError, match="/pid commands"):
+        loop.hand_over()
+    client.others = ""
+    loop.hand_over()
+    assert not client.claims
+
+
+def test_who_publishes_a_topic_is_known_only_after_all_have_announced_themselves() -> None:
+    """In 30 starts a node took up to 3 s to know one that had long been there."""
+    clock, unknown = [100.0], "_NODE_NAME_UNKNOWN_"
+    own = SimpleNamespace(node_namespace="/t", node_name="relay_node")
+
+    def ends(topic: str) -> list[Any]:
+        name = "pid" if clock[0] > 103.3 else unknown
+        other = SimpleNamespace(node_namespace="/", node_name=name)
+        return [own, other][: 1 + (clock[0] > 103.0)]
+
+    client: Any = LoopClient.__new__(LoopClient)
+    client.name, client._joined, client.why_lost = "/t/relay_node", clock[0], lambda: ""
+    client._node = SimpleNamespace(
+        resolve_topic_name=lambda topic: topic, get_publishers_info_by_topic=ends,
+        get_fully_qualified_name=lambda: "/t/tune_loop",
+    )  # fmt: skip
+
+    def spin_once(timeout_sec: float) -> None:
+        clock[0] += timeout_sec
+
+    client._executor = SimpleNamespace(spin_once=spin_once)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop_client.time, "monotonic", lambda: clock[0])
+        assert client.others_on("/u") == "/pid"
+        # Later nothing is waited for, unless a node has no name yet.
+        before, clock[0] = clock[0], 200.0
+        assert client.others_on("/u") == "/pid" and clock[0] == 200.0 > before
 
 
 @pytest.mark.parametrize(
@@ -434,7 +488,9 @@ def test_commands_within_messages_become_parameters() -> None:
         "--command-field", "data[1]", "--command-message", "{data: [0, 0]}",
         "--command-period", "0.1",
     )  # fmt: skip
-    found = arguments(Looker(kind="sensor_msgs/msg/JointState"), given)
+    client = Looker(kind="sensor_msgs/msg/JointState")
+    client.takes = "std_msgs/msg/Float64MultiArray"
+    found = arguments(client, given)
     assert found["measurement_field"] == "velocity[l]"
     assert found["command_field"] == "data[1]"
     # The value of a parameter is read as YAML once more.
@@ -690,6 +746,23 @@ def test_after_an_end_that_would_come_again_the_same_command_is_not_offered_agai
     ((name, told),) = AfterTune(loop, parser).repeated(None)
     assert name == next_step
     assert ("1040" in told) == (next_step == "run it again")
+
+
+def test_after_a_tune_beside_another_program_its_command_is_not_said_to_be_the_last() -> None:
+    words = ["--measurement", "/y", "--command", "/u", "--at", "40", "--within", "3", "9"]
+    parser = tune_loop._parser()
+    given = parser.parse_args(words)
+    given.typed = words
+    why = Code.SECOND_PUBLISHER(topic="/u", others="a node not known yet")
+    client: Any = SimpleNamespace(
+        result=ended(why), record=lambda patience: SimpleNamespace(measurement=np.array([5.0])),
+        others_on=lambda topic: "/pid",
+    )  # fmt: skip
+    loop = topic_loop(client, given)
+    assert loop.left() == "the safe command was sent, but /pid commands, too, and goes on"
+    first, again = AfterTune(loop, parser).repeated(None)
+    assert first == ("first", "end /pid, which commands /u") and again[0] == "run it again"
+    assert Loop(client, given).left().startswith("the safe command was sent, but a node not known")
 
 
 @pytest.mark.parametrize(
