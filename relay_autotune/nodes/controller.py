@@ -198,6 +198,7 @@ class ControllerNode(ServedNode):
             self.context.get_domain_id(),
             # The same numbers are other gains under another law.
             " ".join(filter(None, (measurement.topic_name, values["apply_to"], under))),
+            "" if values["apply_to"] else self._commands.topic_name,
         )
         given = self._own(gains) if self._remote is None else None
         self._keeper = GainsKeeper(self, self._place, journal, given, self._require_bounds)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import hashlib
 import json
 import os
 import stat
@@ -54,18 +55,25 @@ class JournalError(RelayAutotuneError):
 class GainsJournal:
     """The file of one controller's gains.
 
+    Node, domain, loop and command name the file: each loop has its own.
+
     :param folder: folder of the file; created if missing.
-    :param node: fully qualified name of the node, which names the file.
+    :param node: fully qualified name of the node.
     :param domain: the ROS domain: node names are unique only within a domain.
-    :param loop: what the node controls, such as its measurement; the file of another loop is
-        refused.
+    :param loop: what the node controls, such as its measurement.
+    :param command: topic of its commands.
     :raises JournalError: if another process uses the file.
     """
 
-    def __init__(self, folder: Path, node: str, domain: int, loop: str) -> None:
+    def __init__(self, folder: Path, node: str, domain: int, loop: str, command: str) -> None:
         within = f".domain{domain}" if domain else ""
         # A node name never contains a dot, so the replacement is unique.
-        self.path = folder / f"gains{node.replace('/', '.')}{within}.json"
+        name = f"gains{node.replace('/', '.')}{within}"
+        # Topics as a whole could be too long for the name of a file.
+        which = hashlib.sha256(f"{loop} {command}".encode()).hexdigest()[:8]
+        self.path = folder / f"{name}.{which}.json"
+        # Its name before a loop was in it.
+        self._before = folder / f"{name}.json"
         self._loop = loop
         self._lock = threading.Lock()
         self._newest = 0
@@ -82,8 +90,8 @@ class GainsJournal:
         except BlockingIOError:
             self.close()
             raise JournalError(
-                f"another process has {self.path}: a second {node} runs on this machine; end it, "
-                "or give this one another record_directory"
+                f"another process has {self.path}: a second {node} controls this loop; end it, or "
+                "give this one another record_directory"
             ) from None
         except OSError:
             self.close()
@@ -99,18 +107,31 @@ class GainsJournal:
 
         :raises JournalError: if the file is not a journal of this loop.
         """
+        if (found := self._read(self.path)) is None:
+            loop, history = self._read(self._before) or ("", None)
+            return history if loop == self._loop else None
+        loop, history = found
+        if loop != self._loop:
+            raise JournalError(
+                f"{self.path} is of the loop {_short(loop)!r}, found {self._loop!r}: remove the "
+                "file, which is not where it was made"
+            )
+        return history
+
+    def _read(self, path: Path) -> tuple[str, GainsHistory] | None:
+        """Return the loop of a file and its state; None: there is no file."""
         try:
             # Without waiting for the other end of a pipe.
-            descriptor = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+            descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
             with os.fdopen(descriptor, "rb") as file:
                 is_file = stat.S_ISREG(os.fstat(descriptor).st_mode)
                 text = file.read(_LARGEST + 1) if is_file else b""
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
-            raise self._unreadable(str(error)) from error
+            raise _unreadable(path, str(error)) from error
         if len(text) > _LARGEST:
-            raise self._unreadable(f"it has more than {_LARGEST} bytes")
+            raise _unreadable(path, f"it has more than {_LARGEST} bytes")
         try:
             found = json.loads(text)
             version, loop = found["version"], found["loop"]
@@ -118,15 +139,10 @@ class GainsJournal:
         except (
             ValueError, KeyError, TypeError, AttributeError, RecursionError,
         ) as error:  # fmt: skip
-            raise self._unreadable(f"{type(error).__name__}: {_short(error)}") from error
+            raise _unreadable(path, f"{type(error).__name__}: {_short(error)}") from error
         if version != _VERSION:
-            raise self._unreadable(f"it is of version {_short(version)}, expected {_VERSION}")
-        if loop != self._loop:
-            raise JournalError(
-                f"{self.path} is of the loop {_short(loop)!r}, found {self._loop!r}: give another "
-                "record_directory, or remove the file"
-            )
-        return history
+            raise _unreadable(path, f"it is of version {_short(version)}, expected {_VERSION}")
+        return loop, history
 
     def ticket(self) -> int:
         """Return the number of the next state to save."""
@@ -165,11 +181,12 @@ class GainsJournal:
                     "the folder writable, or give another record_directory"
                 ) from error
 
-    def _unreadable(self, why: str) -> JournalError:
-        return JournalError(
-            f"{self.path} is not a journal of gains ({why}): remove it to start with the gains of "
-            "the parameters"
-        )
+
+def _unreadable(path: Path, why: str) -> JournalError:
+    return JournalError(
+        f"{path} is not a journal of gains ({why}): remove it to start with the gains of the "
+        "parameters"
+    )
 
 
 def _values_of(value: Any) -> Any:

@@ -36,7 +36,7 @@ import sys
 from pathlib import Path
 from relay_autotune.control.gains_history import GainSet, GainsHistory
 from relay_autotune.nodes.gains_keeper import GainsJournal
-journal = GainsJournal(Path(sys.argv[1]), "/c", 0, "y")
+journal = GainsJournal(Path(sys.argv[1]), "/c", 0, "y", "u")
 print("ready", flush=True)
 for k in range(10**9):
     journal.save(GainsHistory.begun(GainSet.of({"kc": k + 1.0, "ti": k + 1.0})), journal.ticket())
@@ -75,9 +75,9 @@ def keeper_of(
 
 
 def journal_in(
-    folder: Path, node: str = "/tank/c", domain: int = 0, loop: str = "y"
+    folder: Path, node: str = "/tank/c", domain: int = 0, loop: str = "y", command: str = "u"
 ) -> GainsJournal:
-    return GainsJournal(folder, node, domain, loop)
+    return GainsJournal(folder, node, domain, loop, command)
 
 
 def test_what_is_read_is_what_was_written(tmp_path):
@@ -87,17 +87,35 @@ def test_what_is_read_is_what_was_written(tmp_path):
     assert HISTORY.work is Work.VERIFY
     assert HISTORY.failed == (OTHER,)
     assert journal.load() == HISTORY
-    assert journal.path.name == "gains.tank.c.json"
+    assert journal.path.name.startswith("gains.tank.c.")
     assert not list(journal.path.parent.glob("*.tmp"))
 
 
-def test_each_node_has_its_own(tmp_path):
+def test_each_node_and_each_loop_has_its_own(tmp_path):
     paths = {
-        journal_in(tmp_path, node, domain).path
+        journal_in(tmp_path, node, domain, loop, command).path
         for node in ("/a/b", "/a_b", "/b")
         for domain in (0, 7)
+        for loop in ("/tank/level", "/belt/speed", "/belt/speed simple_pid 0.05 s")
+        for command in ("/tank/valve", "/belt/power")
     }
-    assert len(paths) == 6
+    assert len(paths) == 36
+
+
+def test_a_loop_finds_its_file_of_before_loops_were_in_the_name(tmp_path):
+    before = journal_in(tmp_path)
+    before.save(HISTORY, before.ticket())
+    before.close()
+    before.path.rename(tmp_path / "gains.tank.c.json")
+    # Another loop leaves it alone, however often.
+    for _ in range(2):
+        other = journal_in(tmp_path, loop="/z")
+        assert other.load() is None
+        other.close()
+    journal = journal_in(tmp_path)
+    assert journal.load() == HISTORY
+    journal.save(replace(HISTORY, given=None), journal.ticket())
+    assert journal.load() == replace(HISTORY, given=None)
 
 
 def test_a_second_process_is_refused_and_a_killed_one_leaves_a_whole_file(tmp_path):
@@ -112,7 +130,7 @@ def test_a_second_process_is_refused_and_a_killed_one_leaves_a_whole_file(tmp_pa
             with pytest.raises(JournalError, match="another process has"):
                 journal_in(tmp_path, "/c")
             deadline = time.monotonic() + 20.0
-            while not (tmp_path / "gains.c.json").exists():
+            while not list(tmp_path.glob("gains.c.*.json")):
                 assert time.monotonic() < deadline
             time.sleep(rng.uniform(0.0, 0.05))
         finally:
