@@ -480,7 +480,8 @@ class AfterTune:
         values |= {n: v for n, v in sensor.items() if v != default[n]}
         values |= {"initial_command": options.at, "safe_command": options.at}
         values |= {"initial_setpoint": float(f"{self.result.experiment.settings.setpoint:.6g}")}
-        values |= ranges(options.within, options.command_within)
+        # What a tune may see is not what the sensor can tell: beyond that the command is held.
+        values |= ranges(None, options.command_within)
         values |= parameters_of_law(gains.law, gains.law_period)
         topics, steps = {"measurement": options.measurement}, []
         if command_kind == FLOAT64:

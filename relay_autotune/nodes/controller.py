@@ -135,6 +135,8 @@ class ControllerNode(ServedNode):
             usual_interval=values["repeat_period"],
         )
         self._setpoint: float = values["initial_setpoint"]
+        if not (math.isnan(self._setpoint) or self._is_possible(self._setpoint)):
+            raise ParameterError(f"initial_setpoint is {self._setpoint:g}, beyond {self._range}")
         self._period: float = values["sample_period"]
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         self._count = 0
@@ -261,7 +263,8 @@ class ControllerNode(ServedNode):
         if math.isfinite(value) and not self._is_possible(value):
             self._verifier.out_of_range(value)
             self.get_logger().warning(
-                f"the measurement is {value:g}, outside of its range: the command is held",
+                f"the measurement is {value:g}, outside of its range, {self._range}: the sensor "
+                f"is taken for faulty, and the command held until it is back or these are wider",
                 throttle_duration_sec=5.0,
             )
             value = math.nan
@@ -298,6 +301,11 @@ class ControllerNode(ServedNode):
                 self.get_logger().info(f"{topic} has a subscriber: it begins from {held:g}")
         return untaken
 
+    @property
+    def _range(self) -> str:
+        within = self._settings.within
+        return f"measurement_min {within.low:g} to measurement_max {within.high:g}"
+
     def _is_possible(self, value: float) -> bool:
         within = self._settings.within
         return is_usable(value) and within.low <= value <= within.high
@@ -306,8 +314,8 @@ class ControllerNode(ServedNode):
         value = message.data
         if not self._is_possible(value):
             self.get_logger().error(
-                f"the set-point {value:g} is outside of the measurement's range, so that "
-                f"{self._setpoint:g} stays"
+                f"the set-point {value:g} is outside of the measurement's range, {self._range}, "
+                f"so that {self._setpoint:g} stays"
             )
             return
         if value != self._setpoint:
@@ -505,8 +513,7 @@ class ControllerNode(ServedNode):
         setpoint = self._setpoint if self._remote is None else self._remote.setpoint
         if height and not self._is_possible(setpoint + height):
             raise NotReadyError(
-                f"the step leads to the set-point {setpoint + height:g}, outside of "
-                f"measurement_min to measurement_max"
+                f"the step leads to the set-point {setpoint + height:g}, beyond {self._range}"
             )
         if request.load_step and self._remote is not None:
             raise NotReadyError(

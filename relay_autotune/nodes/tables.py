@@ -158,8 +158,8 @@ OTHERS = (
         "before its step."
     ),
     Quantity("measurement_min", -math.inf, "y").means(
-        "A measurement below this is a fault of the sensor: it is ignored, and the command is "
-        "held."
+        "A measurement below this is a fault of the sensor, which the process cannot reach: it is "
+        "ignored, and the command is held."
     ),
     Quantity("measurement_max", math.inf, "y").means("Likewise above this."),
     Quantity("kc_max", LARGEST_GAIN, "u/y", 0.0, LARGEST_GAIN).means(

@@ -656,10 +656,9 @@ def test_somebody_without_a_controller_is_told_how_to_start_one(
     given = dict(word.split(":=", 1) for word in command if ":=" in word)
     assert given["controller_command"] == "/tank/valve"
     assert float(given["kc"]) > 0.0 and float(given["initial_command"]) == 35.0
-    assert (given["measurement_type"], given["measurement_max"]) == (
-        "std_msgs/msg/Float32",
-        "90.0",
-    )
+    assert (given["measurement_type"], given["command_max"]) == ("std_msgs/msg/Float32", "100.0")
+    # The limits of the tune are not the sensor's range, beyond which the command is held for ever.
+    assert not {"measurement_min", "measurement_max"} & given.keys()
     assert set(given) - {"measurement", "controller_command"} <= {
         e.name for e in CONTROLLER_PARAMETERS
     }

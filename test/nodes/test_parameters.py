@@ -8,7 +8,11 @@ from __future__ import annotations
 import math
 
 import pytest
+import rclpy
 
+from relay_autotune.cli.own_nodes import free_domain
+from relay_autotune.errors import ParameterError
+from relay_autotune.nodes.controller import ControllerNode
 from relay_autotune.nodes.parameters import descriptor_of
 from relay_autotune.nodes.plant import PARAMETERS as PLANT
 from relay_autotune.nodes.tables import FIXED_PARAMETERS, TUNE_PARAMETERS
@@ -69,3 +73,17 @@ def test_every_parameter_is_described_and_its_default_allowed(entry: Quantity) -
     if descriptor.floating_point_range:
         (span,) = descriptor.floating_point_range
         assert span.from_value <= entry.default <= span.to_value
+
+
+def test_a_set_point_that_the_sensor_cannot_tell_is_refused_at_the_start() -> None:
+    values = ("initial_setpoint:=12.0", "measurement_min:=0.0", "measurement_max:=10.0")
+    given = [word for value in values for word in ("-p", value)]
+    with free_domain() as domain:
+        rclpy.init(args=["--ros-args", *given], domain_id=domain)
+        try:
+            with pytest.raises(
+                ParameterError, match=r"initial_setpoint is 12, beyond .* 0 to .* 10"
+            ):
+                ControllerNode()
+        finally:
+            rclpy.try_shutdown()

@@ -86,7 +86,7 @@ def test_each_node_has_a_policy() -> None:
 @pytest.mark.parametrize("name", VARIANTS)
 def test_a_policy_allows_what_its_node_does(name: str, monkeypatch: Any, tmp_path: Any) -> None:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    # The gains that another loop has left in the default folder are refused.
+    # It leaves nothing in the default folder.
     monkeypatch.setenv("HOME", str(tmp_path))
     create, variants = VARIANTS[name]
     needed: Rules = set()
