@@ -71,6 +71,10 @@ class SelectionError(BagError):
         return super().__str__() + "".join(map("".join, zip(flags, reasons, strict=True)))
 
 
+class NotThereError(SelectionError):
+    """A recording does not have a topic or column of the name that was given."""
+
+
 class FieldError(RelayAutotuneError, ValueError):
     """A message has no such field, or its names do not tell which element is meant."""
 

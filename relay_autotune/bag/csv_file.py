@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from relay_autotune.bag.arrays import FloatArray, IntArray
 from relay_autotune.bag.signals import TIME_UNITS, Selection, Signal, flags_of
 from relay_autotune.bag.source import open_regular
 from relay_autotune.bag.text_table import TextTable, Times, listed
-from relay_autotune.errors import BagError, SelectionError
+from relay_autotune.errors import BagError, NotThereError, SelectionError
 
 # Least time that is taken as seconds since 1970: no experiment lasts that long.
 EPOCH = 1.0e8
@@ -143,9 +144,9 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
     :raises BagError: if the file cannot be read, or holds anything but numbers.
     """
     with _table(path) as table:
-        time, pair = _choose(path, table.names, wanted)
+        time, pair, said = _choose(path, table.names, wanted)
         times, (y, u) = table.columns(time, pair)
-    notes = table.notes
+    notes = [*table.notes, *said]
     names = [table.names[at] for at in pair]
     if wanted.measurement is None and wanted.command is None:
         why = _swap(path, names, y, u)
@@ -350,14 +351,27 @@ def _longest_gap(time_ns: IntArray) -> int:
     return int(np.diff(time_ns).max()) if time_ns.size > 1 else 0
 
 
-def _choose(path: Path, names: Sequence[str], wanted: Selection) -> tuple[int | None, list[int]]:
-    """Return the places of the time, None without one, and of measurement and command."""
+def _choose(
+    path: Path, names: Sequence[str], wanted: Selection
+) -> tuple[int | None, list[int], list[str]]:
+    """Return the places of the time, None without one, and of measurement and command, and notes.
+
+    :raises SelectionError: if neither flags nor names tell which they are.
+    """
     given = (wanted.measurement, wanted.command)
     pair = [_named(path, names, name) for name in given if name is not None]
     time = _time(path, names, wanted, pair)
     rest = [k for k in range(len(names)) if k != time]
     if not pair and len(rest) == 2:
         pair = rest
+    choices, notes = _choices([names[k] for k in rest], given), []
+    if len(pair) < 2 and len(choices) == 1 and choices[0].named:
+        ((y, u, _),) = choices
+        pair = [names.index(y), names.index(u)]
+        notes = [
+            f"of {len(names)} columns {y!r} is taken as the measurement and {u!r} as the command, "
+            "as their names say; --measurement and --command name others"
+        ]
     if len(pair) < 2:
         least = (
             "; expected time, measurement and command, or two columns and their sampling "
@@ -368,7 +382,7 @@ def _choose(path: Path, names: Sequence[str], wanted: Selection) -> tuple[int | 
             least = f"; name two of them with --measurement NAME --command NAME{other}, such as"
         raise SelectionError(
             f"{path} has {len(names)} columns: {listed(names)}{least}",
-            _choices([names[k] for k in rest], given),
+            [(flags_of(y, u), "as their names say" * named) for y, u, named in choices],
         )
     if time in pair and wanted.time is None:
         raise SelectionError(
@@ -383,7 +397,7 @@ def _choose(path: Path, names: Sequence[str], wanted: Selection) -> tuple[int | 
             f"time, measurement and command must be three columns of {path}, "
             f"found {listed(chosen)}"
         )
-    return time, pair
+    return time, pair, notes
 
 
 def _time(path: Path, names: Sequence[str], wanted: Selection, taken: Sequence[int]) -> int | None:
@@ -408,8 +422,16 @@ def _time(path: Path, names: Sequence[str], wanted: Selection, taken: Sequence[i
     return called_so[0] if called_so and not _is_time(names[0]) else 0
 
 
-def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[tuple[str, str]]:
-    """Return the flags of each pair of columns that may be measurement and command.
+class _Pair(NamedTuple):
+    """Columns that may be measurement and command, and whether both are named so."""
+
+    measurement: str
+    command: str
+    named: bool
+
+
+def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[_Pair]:
+    """Return each pair of columns that may be measurement and command.
 
     :param names: of the columns that are free.
     :param given: measurement and command, as far as they are named.
@@ -421,8 +443,7 @@ def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[tuple[st
         [name] if name is not None else hinted or unclear
         for name, hinted in zip(given, hints, strict=True)
     ]
-    why = "as their names say" if all(hints) else ""
-    found = [(flags_of(y, u), why) for y in pair[0] for u in pair[1] if y != u]
+    found = [_Pair(y, u, all(hints)) for y in pair[0] for u in pair[1] if y != u]
     return found[:_MOST_CHOICES]
 
 
@@ -481,5 +502,5 @@ def _named(path: Path, names: Sequence[str], wanted: str) -> int:
             f"{path} has {len(fits)} columns named {wanted!r}; expected a name of its own for each"
         )
     if not fits:
-        raise SelectionError(f"{path} has no column {wanted!r}; its columns are {listed(names)}")
+        raise NotThereError(f"{path} has no column {wanted!r}; its columns are {listed(names)}")
     return fits[0]

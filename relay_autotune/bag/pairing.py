@@ -30,7 +30,7 @@ from relay_autotune.bag.field_path import (
 from relay_autotune.bag.limits import MOST_SEARCHED
 from relay_autotune.bag.signals import Selection, Signal, flags_of
 from relay_autotune.bag.topics import Topics, split_name
-from relay_autotune.errors import FieldError, SelectionError, visible
+from relay_autotune.errors import FieldError, NotThereError, SelectionError, visible
 
 _WORDS = {
     "set-point": "setpoint reference ref target desired goal",
@@ -132,7 +132,7 @@ def _checked(topics: Topics, role: str, wanted: str) -> str:
     if topic not in types and f"/{topic}" in types:
         topic = f"/{topic}"
     if topic not in types:
-        raise SelectionError(
+        raise NotThereError(
             f"{topics.path} has no topic {topic!r} for the {role}; it has {topics.listing()}"
         )
     return topics.field_of(topic, part)

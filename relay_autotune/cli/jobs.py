@@ -32,7 +32,7 @@ from relay_autotune.cli.arguments import (
     say,
 )
 from relay_autotune.cli.table import rows, table
-from relay_autotune.errors import RelayAutotuneError, SelectionError, defect
+from relay_autotune.errors import NotThereError, RelayAutotuneError, SelectionError, defect
 from relay_autotune.exchange.export import EXPORTS, WITHOUT_LAW, Target, exported
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import ONLY_JOINT
@@ -65,6 +65,7 @@ class Job:
     :param selection: what of them is wanted.
     :param task: how to identify, and what is asked of the controller.
     :param jointly: whether the experiments of all recordings give one model.
+    :param among_others: whether there are others, which topics or columns may be named for.
     :param table_width: columns of the table for people; None: the document is wanted instead.
     :param name_width: columns of the name in a table with one line for each experiment; 0: the
         table tells all of a bag.
@@ -78,6 +79,7 @@ class Job:
     selection: Selection
     task: Task
     jointly: bool = False
+    among_others: bool = False
     table_width: int | None = None
     name_width: int = 0
     export: tuple[str, Target] | None = None
@@ -98,12 +100,14 @@ class Done:
     :param status: the exit status that it deserves.
     :param said: sentences for standard error.
     :param text: the table, or the document on one line; empty: there is none.
+    :param error: why nothing was found; empty: something was.
     """
 
     name: str
     status: int
     said: tuple[str, ...]
     text: str
+    error: str = ""
 
 
 def work(job: Job) -> Done:
@@ -178,7 +182,14 @@ def analysed(
             said += [f"{path}: {note}" for note in recording.notes]
             records += recording.experiments
         return (analyse_jointly(records, **vars(job.task)),)
-    recording = read_experiments(job.paths, job.selection, progress)
+    try:
+        recording = read_experiments(job.paths, job.selection, progress)
+    except NotThereError as error:
+        if not job.among_others:
+            raise
+        said.append(f"{str(error).partition(';')[0]}: it is read by its own names")
+        own = replace(job.selection, measurement=None, command=None, time=None)
+        recording = read_experiments(job.paths, own, progress)
     said += [f"{job.name}: {note}" for note in recording.notes]
     found = tuple(analyse(each, **vars(job.task), tell=tell) for each in recording.experiments)
     return agreed(found) if recording.of_one_process else found
@@ -217,7 +228,7 @@ def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> s
     if job.table_width is not None:
         if job.name_width:
             # The name of the recording begins the row.
-            why = error and error.partition("\n")[0].removeprefix(job.name).lstrip(": ")
+            why = error and error.removeprefix(job.name).lstrip(": ")
             return "\n".join(rows(job.label, analyses, why, job.name_width, job.table_width))
         if error is not None:
             return ""
@@ -235,7 +246,7 @@ def _failed(job: Job, said: Sequence[str], why: str, status: int) -> Done:
         if any(p in why for p in (job.name, *map(visible, job.paths)))
         else f"{job.name}: {why}"
     )
-    return Done(job.name, status, (*said, sentence), _text(job, (), sentence))
+    return Done(job.name, status, (*said, sentence), _text(job, (), sentence), sentence)
 
 
 def died(job: Job, how: str) -> Done:
@@ -459,6 +470,7 @@ def jobs_of(
             selection=Selection(**taken | {"joint": joint, "joint_order": order}),
             task=task,
             jointly=jointly,
+            among_others=len(groups) > 1,
             table_width=table_width,
         )
         for group in groups

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from relay_autotune.bag.reader import may_be_recording, recordings_in
 from relay_autotune.cli.arguments import (
@@ -41,6 +42,9 @@ from relay_autotune.cli.table import heading
 from relay_autotune.cli.terminal import ProgressLine, Stages, width, write
 from relay_autotune.errors import SelectionError
 from relay_autotune.result import Analysis
+
+if TYPE_CHECKING:
+    from relay_autotune.report.case import Case
 
 PROGRAM = "replay"
 # Columns of a table that names of recordings fill at most.
@@ -141,26 +145,31 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if options.output:
         return _into_file(jobs, options)
     status = DONE
-    analyses: list[tuple[str, Analysis]] = []
+    analyses: list[Analysis] = []
+    cases: list[Case] = []
+    named = options.measurement is not None or options.command is not None
     if jobs[0].name_width:
         write(f"{heading(jobs[0].name_width)}\n", None)
     for done, found in _in_order(jobs, options):
-        if not jobs[0].name_width:
+        if named or not jobs[0].name_width:
             _tell(done)
         if done.text:
             write(f"{done.text}\n", file if found else None)
         status = worst(status, done.status)
-        analyses += [(done.name, analysis) for analysis in found]
-    if analyses and (options.report or options.web):
-        # Imported here, since a table needs none of the report.
-        from relay_autotune.report.case import case_of
+        analyses += found
+        if options.report or options.web:
+            # Imported here, since a table needs none of the report.
+            from relay_autotune.report.case import case_of, unreadable
 
-        cases = as_asked([case_of(analysis, name) for name, analysis in analyses], options)
-        if options.report:
-            write_report(cases, options.report)
-        if options.web:
-            shapings = [analysis.shaping for _, analysis in analyses]
-            show(PROGRAM, parser, options, list(zip(cases, shapings, strict=True)))
+            cases += [case_of(analysis, done.name) for analysis in found]
+            cases += [unreadable(done.name, done.error)] * bool(done.error and options.report)
+    if analyses and options.report:
+        write_report(as_asked(cases, options), options.report)
+        say(PROGRAM, f"the report is {options.report}")
+    if analyses and options.web:
+        shown = as_asked([case for case in cases if case.record is not None], options)
+        shapings = [analysis.shaping for analysis in analyses]
+        show(PROGRAM, parser, options, list(zip(shown, shapings, strict=True)))
     return status
 
 

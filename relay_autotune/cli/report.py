@@ -23,10 +23,12 @@ from relay_autotune.analysis import PARAMETERS, analyse, task_from
 from relay_autotune.cli.arguments import (
     DONE,
     NOTHING_FOUND,
+    USAGE,
     flag_of,
     run_command,
     say,
     typed_as,
+    worst,
 )
 from relay_autotune.cli.jobs import Job, add_analysis, analysed, jobs_of, present_of
 from relay_autotune.cli.terminal import ProgressLine, Stages
@@ -94,23 +96,31 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(options: argparse.Namespace) -> int:
     check_output(PROGRAM, options.output)
+    # Imported here, since it takes long.
+    from relay_autotune.report.case import unreadable
+
     cases: list[Case] = []
-    status = DONE
-    for names, read in _sources(options):
+    status, failed, sources = DONE, 0, _sources(options)
+    for names, read in sources:
         try:
-            cases += read()
-        except SelectionError:
-            raise
+            found = read()
         except RelayAutotuneError as error:
+            unclear = isinstance(error, SelectionError)
+            if unclear and len(sources) == 1:
+                raise
             told = any(name in str(error) for name in names)
             say(PROGRAM, str(error) if told else f"{', '.join(names)}: {error}")
-            status = NOTHING_FOUND
-    if not cases:
-        return NOTHING_FOUND
-    for case in cases:
-        if case.model is None:
-            say(PROGRAM, f"{case.source}: nothing identified: {case.reason}")
-            status = NOTHING_FOUND
+            status = worst(status, USAGE if unclear else NOTHING_FOUND)
+            failed += 1
+            found = [unreadable(", ".join(names), str(error))]
+        else:
+            for case in found:
+                if case.model is None:
+                    say(PROGRAM, f"{case.source}: nothing identified: {case.reason}")
+                    status = worst(status, NOTHING_FOUND)
+        cases += found
+    if failed == len(sources):
+        return status
     cases = as_asked(cases, options)
     write_report(cases, options.output, title=options.title)
     print(options.output)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from relay_autotune.cli.terminal import WIDEST, in_columns, labelled
+from relay_autotune.cli.terminal import NARROWEST, WIDEST, broken, in_columns, labelled
 from relay_autotune.loop.analysis import difference, performance_on
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
@@ -70,7 +70,7 @@ def heading(name_width: int) -> str:
 
     :param name_width: columns of the name.
     """
-    return _line("", "verdict", _NUMBERS, name_width)
+    return _lines("", "verdict", _NUMBERS, name_width, WIDEST)[0]
 
 
 def rows(
@@ -82,9 +82,9 @@ def rows(
     :param analyses: one for each experiment.
     :param error: why there are none; None: there are.
     :param name_width: columns of the name.
-    :param width: columns that a line may have; a reason is cut there.
+    :param width: columns that a line may have; a reason goes on below.
     """
-    lines = [] if error is None else [_line(bag, "-", [error], name_width)]
+    lines = [] if error is None else _lines(bag, "-", [error], name_width, width)
     for number, analysis in enumerate(analyses, start=1):
         name = f"{bag} {number}/{len(analyses)}" if len(analyses) > 1 else bag
         model, gains = analysis.model, analysis.best_gains
@@ -93,13 +93,21 @@ def rows(
         if model is not None and gains is not None:
             values = (model.ultimate_gain, model.ultimate_frequency, gains.kc, gains.ti, gains.td)
             cells = [*map(digits, values), digits(gains.ms, 3)]
-        lines.append(_line(name, verdict, cells, name_width))
-    return [line if len(line) <= width else f"{line[: width - 3]}..." for line in lines]
+        lines += _lines(name, verdict, cells, name_width, width)
+    return lines
 
 
-def _line(name: str, verdict: str, cells: Sequence[str], name_width: int) -> str:
-    told = "".join(f" {cell:>{_NUMBER}}" for cell in cells) if len(cells) > 1 else f"  {cells[0]}"
-    return f"{name:<{name_width}}  {verdict:<{_VERDICT}}{told}"
+def _lines(
+    name: str, verdict: str, cells: Sequence[str], name_width: int, width: int
+) -> list[str]:
+    """Return numbers on a line, or a sentence on as many as it takes; lines in it stay whole."""
+    begin = f"{name:<{name_width}}  {verdict:<{_VERDICT}}"
+    if len(cells) > 1:
+        return ["".join([begin, *(f" {cell:>{_NUMBER}}" for cell in cells)])]
+    first, *copied = cells[0].split("\n")
+    parts = broken(first, max(width - len(begin) - 2, NARROWEST))
+    indent = " " * len(begin)
+    return [f"{indent if k else begin}  {part}" for k, part in enumerate(parts)] + copied
 
 
 def identification_lines(found: Identification, width: int = WIDEST) -> list[str]:

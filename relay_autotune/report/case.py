@@ -316,7 +316,7 @@ def cases_of_document(document: Any, name: str) -> tuple[Case, ...]:
     try:
         document = _visible(document)
         if "error" in document:
-            return (_unreadable(str(document["bag"]), str(document["error"])),)
+            return (unreadable(str(document["bag"]), str(document["error"])),)
         truth = model_of_fields(document["truth"]) if "truth" in document else None
         return tuple(_case(e, str(document["bag"]), truth) for e in document["experiments"])
     except (RelayAutotuneError, LookupError, TypeError, ValueError, AttributeError,
@@ -339,7 +339,12 @@ def _visible(value: Any) -> Any:
     return value
 
 
-def _unreadable(source: str, error: str) -> Case:
+def unreadable(source: str, error: str) -> Case:
+    """Return the case of a recording that gave nothing.
+
+    :param source: its name.
+    :param error: why, a sentence.
+    """
     return Case(source, "", 0.0, 0.0, Outcome.UNKNOWN, f"The recording was not read: {error}")
 
 

@@ -43,8 +43,12 @@ def test_more_columns_are_named(tmp_path):
     path = write(tmp_path / "a.csv", text)
     (record,) = read_experiments(path, Selection("y", "u", "t")).experiments
     np.testing.assert_array_equal(record.time, np.arange(12) * 2.0)
-    with pytest.raises(SelectionError, match=r"5 columns: 'n', 't', 'y', 'u', 'note'; name two"):
-        read_experiments(path)
+    # Names that tell it need not be given.
+    (found,) = read_experiments(path).experiments
+    np.testing.assert_array_equal(found.command, record.command)
+    unclear = write(tmp_path / "b.csv", text.replace("y,u", "a,b", 1))
+    with pytest.raises(SelectionError, match=r"5 columns: 'n', 't', 'a', 'b', 'note'; name two"):
+        read_experiments(unclear)
     with pytest.raises(SelectionError, match=r"no column 'x'; its columns are 'n', 't', 'y'"):
         read_experiments(path, Selection("x", "u"))
     with pytest.raises(SelectionError, match="must be three columns"):

@@ -59,8 +59,16 @@ def test_a_folder_of_bags_is_a_table_with_a_line_each(tmp_path, capsys, more):
     links(tmp_path, 2)
     (tmp_path / "broken.mcap").write_bytes(b"junk")
     (tmp_path / "notes.txt").write_text("to be passed over")
+    names = [f"a column called {k}" for k in "abcd"]
+    (tmp_path / "unclear.csv").write_text(",".join(names) + "\n1,2,3,4\n2,3,4,5\n")
     status, out, err = run(capsys, "--rule", "imc", *more, tmp_path)
     head, *rows = out.splitlines()
+    # What of a column's name says that it may be chosen is not cut off.
+    rows, unclear = rows[:3], rows[3:]
+    assert unclear[0].split()[:2] == ["unclear.csv", "-"] and max(map(len, unclear[:-6])) < 100
+    told = " ".join(" ".join(unclear).split())
+    assert "'a column called d'; name two of them with --measurement NAME" in told
+    assert "--command 'a column called c'" in unclear[-6]
     assert head.split() == ["verdict", "K_u", "w_u", "kc", "ti", "td", "Ms"]
     assert [row.split()[0] for row in rows] == ["bag_0", "bag_1", "broken.mcap"]
     _, json_out, _ = run(capsys, "--json", "--rule", "imc", STEP)
@@ -73,7 +81,8 @@ def test_a_folder_of_bags_is_a_table_with_a_line_each(tmp_path, capsys, more):
         for name in ("kc", "ti", "td"):
             assert told[name] == pytest.approx(gains[name], rel=1e-3)
     assert "broken.mcap  -" in rows[2] and len(rows[2]) < 100
-    assert (status, err) == (1, "")
+    # The choice of columns counts as a matter of the command line.
+    assert (status, err) == (2, "")
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import re
 import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,9 +27,12 @@ from made_bags import (
 )
 
 from relay_autotune.analysis import analyse
+from relay_autotune.bag.csv_file import read_csv
 from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, Definition
+from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
 from relay_autotune.cli import csv_to_bag, replay, terminal, tune
+from relay_autotune.errors import BagError, NotThereError
 from relay_autotune.exchange.export import EXPORTS
 from relay_autotune.record.record import Outcome, Record
 
@@ -235,12 +239,15 @@ def test_one_bad_bag_does_not_stop_the_others(tmp_path, capsys):
     assert err.count("\n") == 1
 
 
-def step_csv(path, count=400):
-    rng = np.random.default_rng(1)
+def stepped(count=400):
     t = np.arange(count) * 0.5
     y = 1.65 * np.where(t > 30.0, 1.0 - np.exp(-(t - 30.0) / 20.0), 0.0)
-    u = np.where(t >= 20.0, 1.0, 0.0)
-    rows = zip(t, y + rng.normal(0.0, 0.005, count), u, t, strict=True)
+    return y + np.random.default_rng(1).normal(0.0, 0.005, count), np.where(t >= 20.0, 1.0, 0.0)
+
+
+def step_csv(path, count=400):
+    t, (y, u) = np.arange(count) * 0.5, stepped(count)
+    rows = zip(t, y, u, t, strict=True)
     text = "Time (s),Level [m],Valve (%),Extra\n" + "".join(
         ",".join(map(repr, map(float, row))) + "\n" for row in rows
     )
@@ -267,17 +274,56 @@ def test_a_csv_and_the_bag_made_of_it_give_equal_numbers(tmp_path, capsys):
 
 def test_a_csv_with_more_columns_gives_the_lines_to_copy(tmp_path, capsys):
     rows = step_csv(tmp_path / "step.csv").read_text().splitlines()
-    path = tmp_path / "of four.csv"
+    path = tmp_path / "of five.csv"
+    # Without the column that says that it is the command.
+    rows[0] = "Time (s),Level [m],Signal (%),Extra"
     path.write_text("".join(f"{row},{'Level SP' if not k else 1}\n" for k, row in enumerate(rows)))
     assert replay.main([str(path)]) == 2
     first, *lines = capsys.readouterr().err.splitlines()
     assert "has 5 columns" in first
     words = shlex.split(lines[0], comments=True)
     assert words == [
-        *("replay", str(path), "--measurement", "Level [m]", "--command", "Valve (%)")
+        *("replay", str(path), "--measurement", "Level [m]", "--command", "Signal (%)")
     ]  # fmt: skip
-    assert len(lines) == 1
+    assert len(lines) == 2
     assert replay.main([*words[1:], "--rule", "imc"]) == 0
+
+
+def test_columns_whose_names_tell_what_they_are_need_no_flags(tmp_path):
+    t, (y, u) = np.arange(400) * 0.5, stepped()
+    path = tmp_path / "FIC101.csv"
+    rows = zip(t, np.full(t.size, 60.0), y, u, strict=True)
+    path.write_text(
+        "Time,FIC101.SP,FIC101.PV,FIC101.OP\n"
+        + "".join(",".join(map(repr, map(float, row))) + "\n" for row in rows)
+    )
+    (log,) = read_csv(path, Selection())
+    assert (log.measurement.name, log.command.name) == ("FIC101.PV", "FIC101.OP")
+    (note,) = [n for n in log.notes if "as their names say" in n]
+    assert "--measurement and --command name others" in note
+    (log,) = read_csv(path, Selection(command="FIC101.SP"))
+    assert (log.measurement.name, log.command.name) == ("FIC101.PV", "FIC101.SP")
+
+
+def test_names_given_for_several_apply_to_those_that_have_them(tmp_path, capsys, monkeypatch):
+    asked = []
+
+    def read(paths, selection, progress=None):
+        asked.append((Path(paths[0]).name, selection.measurement, selection.command))
+        if paths[0].endswith("oven.csv") and selection.measurement == "PV":
+            raise NotThereError("oven.csv has no column 'PV'; its columns are a, b")
+        raise BagError("no more")
+
+    monkeypatch.setattr("relay_autotune.cli.jobs.read_experiments", read)
+    for name in ("oven.csv", "fan.csv"):
+        (tmp_path / name).write_text("t,a,b\n")
+    given = ["--measurement", "PV", "--command", "OP"]
+    assert replay.main([str(tmp_path), *given]) == 1
+    assert asked == [("fan.csv", "PV", "OP"), ("oven.csv", "PV", "OP"), ("oven.csv", None, None)]
+    assert "oven.csv has no column 'PV': it is read by its own names" in capsys.readouterr().err
+    # A single recording is expected to have them.
+    assert replay.main([str(tmp_path / "oven.csv"), *given]) == 2
+    assert "its columns are a, b" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", [replay, tune])
@@ -291,7 +337,9 @@ def test_an_unknown_program_is_told_in_one_line_which_there_are(capsys, command)
 def test_csv_to_bag_refuses_what_it_cannot_do(tmp_path, capsys):
     path = step_csv(tmp_path / "step.csv")
     columns = ("--measurement", "Level [m]", "--command", "Valve (%)")
-    assert csv_to_bag.main([str(path), str(tmp_path / "bag")]) == 2
+    unclear = tmp_path / "unclear.csv"
+    unclear.write_text("t,a,b,c\n0,1,2,3\n1,1,2,3\n")
+    assert csv_to_bag.main([str(unclear), str(tmp_path / "bag")]) == 2
     assert "name two of them" in capsys.readouterr().err
     bad = ("--measurement-topic", "no topic")
     assert csv_to_bag.main([str(path), str(tmp_path / "bag"), *columns, *bad]) == 2

@@ -156,8 +156,27 @@ def test_replay_writes_the_report_beside_its_table(capsys, tmp_path, monkeypatch
     page = tmp_path / "page.html"
     assert replay.main([str(tmp_path / "log.csv"), "--report", str(page)]) == 0
     assert "Gains to type in" in page.read_text()
+    assert f"the report is {page}" in capsys.readouterr().err
     assert replay.main([str(tmp_path / "log.csv"), "--report", str(tmp_path / "page.doc")]) == 2
     assert "does not say what the report is to be" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [replay, report])
+def test_a_recording_that_gave_nothing_stands_in_the_report_of_several(
+    tmp_path, monkeypatch, command
+) -> None:
+    only(monkeypatch, "uncertainty")
+    monkeypatch.setattr("relay_autotune.cli.jobs.analyse", lambda record, **_: completed())
+    write_csv(tmp_path / "good.csv")
+    (tmp_path / "unclear.csv").write_text("t,a,b,c\n0,1,2,3\n1,1,2,3\n")
+    page = tmp_path / "page.html"
+    logs = [str(tmp_path / name) for name in ("good.csv", "unclear.csv", "none.csv")]
+    flag = "--report" if command is replay else "-o"
+    assert command.main([*logs, flag, str(page)]) == 2
+    text = page.read_text()
+    assert "Gains to type in" in text
+    assert "name two of them with --measurement NAME --command NAME" in text
+    assert "none.csv does not exist" in text
 
 
 def test_an_earlier_report_is_replaced_with_a_word_and_the_page_of_another_never(
