@@ -696,7 +696,11 @@ void startController() {
         weights=(0.0, 1.0),
         head="from simple_pid import PID\n\npid = PID(",
         line="    {name}={value},",
-        tail=")\n# pid.setpoint = ...; then, every sample_time: command = pid(measurement)",
+        # Without dt a call that comes a bit early is left out: a third of those of a timer.
+        tail=(
+            ")\n# pid.setpoint = ...; then, every sample_time, with dt so that none is left out:\n"
+            "# command = pid(measurement, dt=pid.sample_time)"
+        ),
         bounds=lambda low, high: (("output_limits", f"({_or_none(low)}, {_or_none(high)})"),),
         start=Start("starting_output is the present command.", "starting_output"),
         ending="py",
