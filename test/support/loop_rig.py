@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from forked import Forked, can_fork
 from rcl_interfaces.srv import GetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -56,6 +57,11 @@ class Process:
         self.segments: set[Path] = set()
         # A terminal becomes the controlling terminal of the process.
         own = output is not None and os.isatty(output)
+        self._process: Forked | subprocess.Popen[bytes]
+        if output is None and can_fork(command, environment):
+            log.touch()
+            self._process = Forked(command, environment, log)
+            return
         with log.open("wb") as file:
             self._process = subprocess.Popen(
                 command,
@@ -169,8 +175,10 @@ class Rig:
         parameters.setdefault("record_directory", str(self.records))
         return self.start("relay_node", *arguments, **parameters)
 
-    def identifier(self, **parameters: Any) -> Process:
-        return self.start("identifier_node", **parameters)
+    def identifier(self, *arguments: str, **parameters: Any) -> Process:
+        """Start an identifier_node; to choose among structures, which takes seconds, give ""."""
+        parameters.setdefault("structure", "fopdt")
+        return self.start("identifier_node", *arguments, **parameters)
 
     # Observing.
 
@@ -307,4 +315,4 @@ def _yaml(value: Any) -> str:
         return text if "." in text else text.replace("e", ".0e")
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(_yaml(v) for v in value)}]"
-    return str(value)
+    return str(value) or "''"

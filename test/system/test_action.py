@@ -19,7 +19,7 @@ from relay_autotune_msgs.action import Tune
 
 LOOP = {
     "mode": "lockstep",
-    "lockstep_speed": 50.0,
+    "lockstep_speed": 15.0,
     "sample_period": 0.1,
     "structure": "fopdt",
     "gain": 2.0,

@@ -358,7 +358,7 @@ def start_plant(rig: Rig) -> None:
     rig.plant(
         sample_period=0.1,
         mode="lockstep",
-        lockstep_speed=50.0,
+        lockstep_speed=15.0,
         structure="fopdt",
         time_constants=[2.0],
         dead_time=1.0,

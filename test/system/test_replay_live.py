@@ -40,7 +40,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
     with free_domain() as domain:
         rig = Rig(domain, tmp_path_factory.mktemp("replay_live"))
         try:
-            rig.identifier()
+            rig.identifier(structure="")
             yield rig
         finally:
             rig.close()

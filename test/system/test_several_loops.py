@@ -48,7 +48,7 @@ class Loop:
             measurement_timeout=5.0,
             **facts["relay"],
         )
-        rig.start("identifier_node", *space)
+        rig.identifier(*space)
         self.truth = facts["ultimate_gain"]
 
     def start(self) -> None:

@@ -60,7 +60,7 @@ def test_a_tune_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None:
     # A busy machine repeats some of them later, and none earlier.
     assert np.quantile(np.diff(time[:20]), 0.25) == pytest.approx(0.02, rel=0.2)
     done = subprocess.run(
-        [shutil.which("replay") or "replay", "--json", str(rig.bag(answer))],
+        [str(shutil.which("replay")), "--json", "--structure=fopdt", str(rig.bag(answer))],
         capture_output=True,
         text=True,
         timeout=60,

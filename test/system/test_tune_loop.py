@@ -67,7 +67,7 @@ def ready(rig: Rig) -> None:
 
 def test_a_tune_is_shown_and_its_result_printed(rig: Rig) -> None:
     # While it waits for this test's commands a lockstep without limit would take a processor.
-    quick = {"mode": "lockstep", "lockstep_speed": 50.0, "seed": 3}
+    quick = {"mode": "lockstep", "lockstep_speed": 15.0, "seed": 3}
     rig.start("plant_node", *NAMED, **quick, **LOOP)
     records = str(rig.records)
     rig.start(
@@ -84,7 +84,7 @@ def test_a_tune_is_shown_and_its_result_printed(rig: Rig) -> None:
         status, output, said = run(rig, "--namespace", "tank", "--wait", "0.5")
     assert status == 1
     assert error(said).startswith("tune_loop: no identifier_node publishes /tank/pi_gains")
-    rig.start("identifier_node", *NAMED, rule="imc")
+    rig.identifier(*NAMED, rule="imc")
     page = rig.records.parent / "page.html"
     status, output, said = run(rig, "--report", str(page), "--ros-args", "-r", "__ns:=/tank")
     assert status == 0, said
@@ -94,7 +94,7 @@ def test_a_tune_is_shown_and_its_result_printed(rig: Rig) -> None:
     (bag,) = Path(records).iterdir()
     for part in ("completed: ", "(fopdt, waveform)", "kc ", str(bag), f"xdg-open {page}"):
         assert part in output
-    assert output.endswith(f"replay {bag} --rule imc\n")
+    assert output.endswith(f"replay {bag} --rule imc --structure fopdt\n")
     kc = re.search(r"kc (\S+)", output)[1]
     assert kc in page.read_text()
 
@@ -166,7 +166,7 @@ def test_a_terminal_that_is_closed_cancels(rig: Rig) -> None:
     "number", [signal.SIGINT, pytest.param(signal.SIGHUP, marks=pytest.mark.nightly)]
 )
 def test_a_model_that_takes_for_ever_is_not_waited_for(rig: Rig, number: int) -> None:
-    quick = {"mode": "lockstep", "lockstep_speed": 50.0, "seed": 3}
+    quick = {"mode": "lockstep", "lockstep_speed": 15.0, "seed": 3}
     rig.start("plant_node", *NAMED, **quick, **LOOP)
     relay = rig.start(
         "relay_node", *NAMED, amplitude=0.5, baseline=1.0, sample_period=0.1,

@@ -157,7 +157,7 @@ def test_from_the_start_to_verified_gains_by_clicks(rig: Rig, tmp_path: Path) ->
         "controller_node", *NAMED, use_sim_time=True, kc=0.3, ti=0.8, initial_command=1.0,
         initial_setpoint=5.0,
     )  # fmt: skip
-    rig.start("identifier_node", *NAMED, use_sim_time=True)
+    rig.identifier(*NAMED, use_sim_time=True)
     command, url = page_of(rig)
     page = OpenPage(url)
     accepted(rig, page)

@@ -51,7 +51,7 @@ def tune_in_lockstep(rig: Rig, **plant: Any) -> tuple[Results, Path]:
         **plant,
     )
     relay = rig.relay(amplitude=1.0, baseline=2.0, sample_period=PERIOD)
-    rig.identifier()
+    rig.identifier(structure="")
     answer = rig.tune()
     rig.until(lambda: results.gains, "gains")
     # They come by topics of their own.
@@ -189,7 +189,7 @@ def test_real_time(rig: Rig) -> None:
         operating_point=[5.0, 1.0],
     )
     relay = rig.relay(amplitude=0.5, initial_command=1.0, measurement_timeout=3.0)
-    rig.identifier()
+    rig.identifier(structure="")
     answer = rig.tune()
     rig.until(lambda: results.gains, "gains")
     # They come by topics of their own.
