@@ -12,6 +12,7 @@ import re
 import select
 import signal
 import sys
+import termios
 import textwrap
 import threading
 import time
@@ -325,6 +326,7 @@ def asked_for_file(what: str, names: Collection[str]) -> str:
     :param what: what would be written.
     :param names: programs that may be named in its place.
     """
+    _forget_typed()
     while True:
         answer = _input(f"{what}: file name, or another program [none]: ")
         if answer.lower() in ("n", "no", "none"):
@@ -347,6 +349,7 @@ def agrees(question: str, *, yes: bool) -> bool:
     if yes:
         return True
     _require_somebody("--yes")
+    _forget_typed()
     return _input(f"\n{question} [y/N] ").lower() in ("y", "yes")
 
 
@@ -408,6 +411,7 @@ def agreed_step(question: str, step: float, allowed: StepRange) -> float:
     """
     _require_somebody("--yes")
     print("\n" + "\n".join(broken(question, width())))
+    _forget_typed()
     while True:
         answer = _input(f"[y/N, or another step, such as {0.5 * step:.2g}] ").lower()
         if answer in ("", "n", "no", "y", "yes"):
@@ -458,6 +462,12 @@ def asked(
 def _require_somebody(flag: str) -> None:
     if not sys.stdin.isatty():
         raise LoopError(f"nobody can be asked here: give {flag}")
+
+
+def _forget_typed() -> None:
+    """Forget what was typed at a terminal before a question, which nobody had read then."""
+    with suppress(termios.error, OSError, ValueError):
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)
 
 
 def _input(shown: str) -> str:

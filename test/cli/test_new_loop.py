@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import re
 import signal
 import subprocess
@@ -30,7 +31,15 @@ from relay_autotune.cli.after_tune import AfterTune, prefix
 from relay_autotune.cli.loops import Loop, TopicLoop
 from relay_autotune.cli.own_nodes import OwnNodes, namespace_of_joint, ros_arguments
 from relay_autotune.cli.settings import Kind, kind_of
-from relay_autotune.cli.terminal import agrees, asked_for_file, broken, number_of, pair_of
+from relay_autotune.cli.terminal import (
+    agreed_step,
+    agrees,
+    asked_for_file,
+    broken,
+    number_of,
+    pair_of,
+)
+from relay_autotune.control.verification import StepRange
 from relay_autotune.errors import LoopError, ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS, Target, exported
 from relay_autotune.exchange.messages import fill_gains, fill_reason
@@ -467,6 +476,33 @@ def test_where_nobody_can_be_asked_the_flag_is_named(monkeypatch: pytest.MonkeyP
     with pytest.raises(LoopError, match="give --yes"):
         agrees("Start?", yes=False)
     assert agrees("Start?", yes=True)
+
+
+@pytest.mark.parametrize(
+    ("typed_ahead", "ask", "expected"),
+    [
+        ("y", lambda: agrees("Start?", yes=False), False),
+        ("5", lambda: agreed_step("Prove?", 2.0, StepRange(1.0, 9.0)), 0.0),
+        ("0 100", lambda: asked_for_file("Write", EXPORTS), ""),
+    ],
+)
+def test_what_was_typed_before_a_question_moves_nothing(
+    typed_ahead: str, ask: Callable[[], object], expected: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    window, inside = os.openpty()
+    with os.fdopen(inside) as terminal_in:
+        monkeypatch.setattr(sys, "stdin", terminal_in)
+        # While the tune computed; then Enter at the question.
+        os.write(window, f"{typed_ahead}\n".encode())
+        wait = terminal._await_line
+
+        def typed_then(shown: str) -> None:
+            os.write(window, b"\n")
+            wait(shown)
+
+        monkeypatch.setattr(terminal, "_await_line", typed_then)
+        assert ask() == expected
+    os.close(window)
 
 
 def test_flags_of_a_new_loop_need_both_topics() -> None:
