@@ -714,9 +714,13 @@ class Code(enum.IntEnum):
     """Somebody else has changed the loop during the step."""
 
     # Defects.
-    NODE_FAILED = _Row(900, "the node failed: {error}")
-    """A defect of ours: report the sentence, with the recording if you can. The same command
-    would meet it again."""
+    NODE_FAILED = _Row(
+        900,
+        "the node failed: {error}",
+        "this is a defect of relay_autotune: tune again with its newest version; if that meets "
+        "it, too, report this line, with the recording if you can",
+    )
+    """The same command with the same version would meet it again."""
 
 
 def reason_of(error: BaseException) -> Reason:

@@ -146,9 +146,11 @@ def replay(
         return _failed(job, said, why, NOTHING_FOUND), ()
     status = status_of(analyses)
     if status == NOTHING_FOUND:
-        # A model that a check contradicts is shown, with the reason why there are no gains.
+        # A table has the reason for a model without gains.
         said += [
-            f"{job.name}: {'' if a.models else 'nothing identified: '}{a.reason}" for a in analyses
+            f"{job.name}: {'' if a.models else 'nothing identified: '}{a.reason}"
+            for a in analyses
+            if not (a.models and job.table_width)
         ]
     return Done(job.name, status, tuple(said), _text(job, analyses)), analyses
 
@@ -159,7 +161,7 @@ def status_of(analyses: Sequence[Analysis]) -> int:
     :param analyses: of its experiments.
     """
     return exit_status(
-        found=any(a.models and not a.judgement.contradicted for a in analyses),
+        found=any(a.best_gains is not None for a in analyses),
         doubtful=any(a.verdict is Verdict.DOUBTFUL for a in analyses),
     )
 

@@ -59,9 +59,9 @@ Of a folder of recordings a table is printed as they are done, a line for each
 experiment.
 
 Results go to standard output, everything else to standard error.
-Exit status: 0 done; 1 nothing was identified in at least one bag; 2 the command
-line, or the choice of topics, is wrong; 3 gains of at least one experiment are
-doubtful.
+Exit status: 0 every bag gave gains; 1 at least one gave none; 2 the command
+line, or the choice of topics or columns, is wrong; 3 gains of at least one
+experiment are doubtful.
 
 Examples, with the recordings that come with the package:
   replay bags/biased_relay

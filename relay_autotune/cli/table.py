@@ -191,7 +191,9 @@ def _laid_out(entries: Sequence[_Entry], width: int) -> list[str]:
 def _experiment(analysis: Analysis, which: str) -> list[_Entry]:
     record = analysis.record
     lines = [(f"experiment{which}", _outcome(record))]
-    if record.reason and record.outcome != Outcome.COMPLETED:
+    # The reason for no gains begins with it.
+    told = record.reason in analysis.reason
+    if record.reason and not told and record.outcome != Outcome.COMPLETED:
         lines.append(("", record.reason))
     lines.append(("recorded", _span(record)))
     lines += _limit_cycle(analysis)
@@ -213,8 +215,10 @@ def _verdict(judgement: Judgement) -> list[_Entry]:
     if judgement.contradicted and not judgement.refused:
         # The worst finding is shown where the gains would be.
         worse = [f for f in worse if f is not judgement.worst]
+    # What was refused was not for its checks.
+    told = [judgement.verdict.name.lower(), *[judgement.passed] * (not judgement.refused)]
     return [
-        ("verdict", ", ".join([judgement.verdict.name.lower(), judgement.passed])),
+        ("verdict", ", ".join(told)),
         *((f"  {found.title.lower()}", found.said) for found in worse),
     ]
 

@@ -170,14 +170,16 @@ def test_an_experiment_that_did_not_end_well_has_a_model_but_no_gains(tmp_path, 
     )
     status, out, _ = run(capsys, "--json", tmp_path / "bag")
     (experiment,) = documents(out)[0]["experiments"]
-    assert status == 0
+    assert status == 1
     assert experiment["models"]
     assert experiment["gains"] == []
     assert experiment["recommended"] is None
     assert experiment["outcome"] == outcome.name.lower()
     assert experiment["reason"] == "the operator pressed the button"
-    _, out, _ = run(capsys, tmp_path / "bag")
-    assert "the operator pressed the button" in out
+    status, out, err = run(capsys, tmp_path / "bag")
+    assert status == 1
+    assert (out + err).count("the operator pressed the button") == 1
+    assert re.search(r"^  verdict +none$", out, re.M)
     assert "ISA form" not in out
 
 
@@ -195,7 +197,7 @@ def test_a_bag_of_a_killed_node_gives_a_model_and_no_gains(tmp_path, capsys):
     bag.flush()
     status, out, err = run(capsys, "--json", tmp_path / "bag")
     (experiment,) = documents(out)[0]["experiments"]
-    assert status == 0
+    assert status == 1
     assert "unfinished recording" in err
     assert experiment["outcome"] == "aborted"
     assert experiment["reason"].startswith("the recording ends without the experiment's end")
