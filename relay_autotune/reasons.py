@@ -612,12 +612,9 @@ class Code(enum.IntEnum):
 
     # Model and gains.
     NO_MODEL_YET = _Row(
-        400,
-        "no model has come, so the step cannot be predicted",
-        "run a tune first",
-        transient=True,
+        400, "no model has come yet, so the step cannot be predicted", transient=True
     )
-    """controller_node has no model of this loop."""
+    """controller_node has no model of this loop: run a tune first."""
     QUEUE_FULL = _Row(401, "{waiting} other records wait", "ask again later", transient=True)
     """identifier_node has too much to do."""
     NOT_ANALYSED = _Row(901, "the record could not be analysed: {why}")

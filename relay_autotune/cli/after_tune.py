@@ -502,7 +502,8 @@ class AfterTune:
             file = str(Path(bag, f"{CONTROLLER}.yaml"))
             write(node_parameters(gains, values, topics), file)
             words = [CONTROLLER, "--gains", file]
-        return [("control with these gains", prefix() + shlex.join(words)), *steps]
+        started = ("control with these gains", prefix() + shlex.join(words))
+        return [started, ("set-points for it", f"{FLOAT64} on /setpoint"), *steps]
 
     # Their proof.
 

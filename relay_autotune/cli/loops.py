@@ -206,11 +206,11 @@ class TopicLoop(Loop):
             return
         if sys.stdin.isatty() and needed and len(UNITS) < 2:
             print("u is the command's unit, y the measurement's", file=sys.stderr)
-        answers.ask("at")
-        answers.ask("within")
-        if answers["command_within"] is not None or not options.amplitude:
-            # The amplitude is found between these.
-            answers.ask("command_within")
+        # What is given and cannot be is refused before anything is asked for.
+        for name in sorted(self.form[:3], key=needed.count):
+            # The amplitude is found between the limits of the command.
+            if name != "command_within" or name not in needed or not options.amplitude:
+                answers.ask(name)
 
     def _choose_field(self) -> None:
         """Ask for the number that measures where the messages do not have the one of --field.

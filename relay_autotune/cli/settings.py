@@ -200,9 +200,13 @@ class Answers:
         """Return what is seen of a setting's quantity now; empty: nothing."""
         if name == "amplitude":
             return ""
-        value = self.measured if name == "within" else self["at"]
-        unknown = value is None or math.isnan(value)
-        return "" if unknown else f"{value:.4g} {SETTING[name].unit} now"
+        value = self._seen(name)
+        return "" if math.isnan(value) else f"{value:.4g} {SETTING[name].unit} now"
+
+    def _seen(self, name: str) -> float:
+        """Return the present value of a setting's quantity; NaN: it is not known."""
+        at = math.nan if self["at"] is None else float(self["at"])
+        return self.measured if name == "within" else at
 
     def why_impossible(self, name: str, value: Any) -> str:
         """Return why a value cannot be, as far as is known now; empty: it can.
@@ -211,9 +215,9 @@ class Answers:
         :param value: that is given.
         """
         if name == "within":
-            seen, what = self.measured, "the measurement is {} now"
+            what = "the measurement is {} now"
         elif name == "command_within":
-            seen, what = self["at"], "the present command is {}"
+            what = "the present command is {}"
         elif name == "at" and (limits := self["command_within"]):
             low, high = limits
             told = f"expected a command from {low:g} to {high:g}, the limits of the actuator"
@@ -222,8 +226,8 @@ class Answers:
             return "" if value >= 0.0 else "expected at least 0"
         else:
             return ""
-        low, high = value
-        fine = seen is None or math.isnan(seen) or low <= seen <= high
+        (low, high), seen = value, self._seen(name)
+        fine = math.isnan(seen) or low <= seen <= high
         return "" if fine else f"{what.format(f'{seen:.6g}')}: give limits around it"
 
     def ask(self, name: str, what: str = "", example: str = "") -> None:
@@ -237,7 +241,10 @@ class Answers:
         if self[name] is not None:
             self.take({name: self[name]}, self.source(name))
             return
-        example, seen = example or setting.example, self.now(name)
+        seen = self.now(name)
+        if setting.ends > 1 and seen:
+            example = "{:g} {:g}".format(*_around(self._seen(name)))
+        example = example or setting.example
         question = f"{what or setting.question} [{SETTING[name].unit}]" + f", {seen}" * bool(seen)
 
         def read(text: str) -> Any:
@@ -274,6 +281,16 @@ class Answers:
             if (value := self[name]) is not None:
                 found |= SETTING[name].values(value)
         return found
+
+
+def _around(value: float) -> tuple[float, float]:
+    """Return a range of round numbers with room about a value, from 0 on."""
+    if value == 0.0:
+        return -1.0, 1.0
+    most = 2.0 * abs(value)
+    power = 10.0 ** math.floor(math.log10(most))
+    end = next((n * power for n in (1.0, 2.0, 5.0) if n * power >= most), 10.0 * power)
+    return (0.0, end) if value > 0.0 else (-end, 0.0)
 
 
 def _numbers(value: Any) -> list[float]:
@@ -358,13 +375,14 @@ def kind_of(options: argparse.Namespace) -> Kind:
         raise SelectionError("--open and the like are for a joint: give --controller, --joint")
     if options.measurement and options.command:
         return Kind.TOPICS
+    lacking = [f"--{name}" for name in ("measurement", "command") if not getattr(options, name)]
     for each in SETTINGS:
         # One with a default is not told from one that is not given.
         if (
             each.name not in ("amplitude", "field", "yes")
             and getattr(options, each.name) is not None
         ):
-            told = "is for a loop without nodes: give --measurement and --command, too"
+            told = f"is for a loop without nodes: give {' and '.join(lacking)}, too"
             raise SelectionError(f"{flag_of(each)} {told}")
     return Kind.NODES
 

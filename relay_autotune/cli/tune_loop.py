@@ -87,6 +87,10 @@ def _require_consistent(parser: argparse.ArgumentParser, options: argparse.Names
         )
     if options.export in EXPORTS:
         parser.error(f"--export takes a file to write, such as gains.yaml, not {options.export}")
+    if options.step is not None and (
+        options.verify is False or (options.yes and not options.verify)
+    ):
+        parser.error("--step is that of the proof, which is not wanted here: give --verify, too")
     if options.verify and (options.web or options.json or options.record_only or options.dry_run):
         parser.error(
             "--verify proves the gains of a tune that prints them: leave out --web, --json, "

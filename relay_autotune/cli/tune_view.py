@@ -133,6 +133,9 @@ def live_lines(
     :param width: columns of the terminal, at least `NARROWEST`.
     """
     state = STATES[feedback.state]
+    if state in OUTCOMES:
+        # Its time stands still while the model is computed.
+        since = 0.0
     done = round(_BAR * min(max(feedback.progress, 0.0), 1.0))
     full, empty = ("█", "░") if paint.blocks else ("#", "-")
     colour = {"completed": _GREEN, "aborted": _RED, "failed": _RED}.get(state, _YELLOW)
@@ -222,8 +225,8 @@ def _verdict_lines(result: Any, paint: Paint, columns: int) -> list[str]:
     known = verdict is Verdict.TRUSTED and math.isfinite(result.gains.ms_95)
     if known and (model.undetermined or model.warnings):
         told = (
-            f"all the same: with these gains Ms stays below {digits(result.gains.ms_95, 3)} on "
-            f"95 % of the models that the data allow, whatever is not determined or warned of here"
+            f"whatever is not determined or warned of here, with these gains Ms stays below "
+            f"{digits(result.gains.ms_95, 3)} on 95 % of the models that the data allow"
         )
     return lines + (labelled("", told, columns) if told else [])
 
@@ -243,7 +246,7 @@ def model_lines(message: Any, paint: Paint, columns: int = WIDEST) -> list[str]:
         if math.isfinite(low):
             doubt = paint("   not determined", _YELLOW) if name in message.undetermined else ""
             label = "  " + name.replace("_", " ")
-            lines.append(f"  {label:<16} 95 %: {digits(low)} to {digits(high)}{doubt}")
+            lines.append(f"  {label + ' ':<16} 95 %: {digits(low)} to {digits(high)}{doubt}")
     if math.isfinite(message.ultimate_gain):
         label = "  ultimate point"
         lines.append(
@@ -272,7 +275,7 @@ def next_commands(
     steps = []
     if report:
         steps.append(("see it in figures", f"xdg-open {shlex.quote(report)}"))
-    if result.bag:
+    if result.bag and result.outcome == result.COMPLETED:
         bag = f"{shlex.quote(result.bag)} {flags}".rstrip()
         if result.transfer_function.experiment_id and not report:
             steps.append(("see it in figures", f"{prefix}report {bag} -o report.html"))

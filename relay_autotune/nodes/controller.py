@@ -81,15 +81,19 @@ def _topics(file: str) -> dict[str, str]:
     """Return the names of the topics that a file of gains gives."""
     try:
         read = yaml.safe_load(Path(file).read_text(encoding="utf-8"))
-        section = read.get(TOPICS, {}).get("ros__parameters", {})
-        return {str(name): str(topic) for name, topic in section.items()}
+        sections = {name: section["ros__parameters"] for name, section in read.items()}
+        own = any("kc" in values for values in sections.values())
+        topics = sections.get(TOPICS, {}).items()
     except (OSError, UnicodeDecodeError) as error:
         raise ParameterError(f"{FLAG} {file}: it cannot be read ({error})") from None
-    except (yaml.YAMLError, AttributeError) as error:
-        what = str(error).partition("\n")[0]
+    except (yaml.YAMLError, AttributeError, KeyError, TypeError):
+        own = False
+    if not own:
         raise ParameterError(
-            f"{FLAG} {file}: expected the parameters of a controller_node in YAML ({what})"
-        ) from None
+            f"{FLAG} {file}: it has no kc of a controller_node; expected a file that tune_loop "
+            f"has written for one, or --export controller_node"
+        )
+    return {str(name): str(topic) for name, topic in topics}
 
 
 # How long the end of the process waits for the acknowledgement of its last message.
@@ -213,7 +217,8 @@ class ControllerNode(ServedNode):
         self.get_logger().info(
             f"ready: {said(self._pid.gains)}, "
             f"{'automatic' if self._pid.is_automatic else 'holding its command'}; "
-            f"commands go to {self._commands.topic_name}, held until somebody subscribes to it"
+            f"commands go to {self._commands.topic_name}, held until somebody subscribes to it; "
+            f"set-points come on {self.resolve_topic_name('setpoint')}"
         )
 
     # The loop.

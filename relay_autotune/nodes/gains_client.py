@@ -403,7 +403,7 @@ class GainsClient(LoopClient):
                 raise LoopError(f"{self.name} has not verified the gains: {result.reason}")
             # auto_apply may be faster.
             goal.apply = goal.apply and not (new is not None and self.has(new))
-            tell(result.reason)
+            tell(f"waiting: {result.reason}")
             self.wait(leave, TOLD_EVERY)
         raise LoopError("the verification was ended before it began: the gains are as before")
 

@@ -378,6 +378,36 @@ def test_what_failed_names_the_flag_and_no_node_that_ends_with_the_command() -> 
     assert own.checklist(answer) == answer.checks
 
 
+def test_what_is_given_and_cannot_be_is_refused_before_any_question(typed: list[str]) -> None:
+    # Nothing is typed, so that a question would fail.
+    with pytest.raises(SelectionError, match=r"--within 50 110: the measurement is 0.82 now"):
+        TopicLoop(Looker(measures=0.82), options("--within", "50", "110"))
+
+
+@pytest.mark.parametrize(
+    ("measured", "example"),
+    [(0.82, "0 2"), (44.0, "0 100"), (-3.0, "-10 0"), (0.0, "-1 1"), (math.nan, "30 50")],
+)
+def test_an_example_of_limits_has_the_present_value_in_it(
+    measured: float, example: str, typed: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[str] = []
+    monkeypatch.setattr("relay_autotune.cli.terminal._await_line", shown.append)
+    typed += ["-10 100"]
+    given = options("--at", "2", "--command-within", "0", "5")
+    TopicLoop(Looker(measures=measured), given)
+    assert shown[0].endswith(f"such as {example}: ")
+
+
+@pytest.mark.parametrize("words", [("--no-verify",), ("--yes",)])
+def test_a_step_without_a_proof_is_refused(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        tune_loop.main([*words, "--step", "5"])
+    assert "give --verify, too" in capsys.readouterr().err
+
+
 def test_a_question_shows_what_is_now_and_refuses_what_cannot_be(
     typed: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -509,10 +539,12 @@ def test_flags_of_a_new_loop_need_both_topics() -> None:
     assert kind_of(options()) is Kind.TOPICS
     given = options("--within", "1", "9")
     given.command = None
-    with pytest.raises(SelectionError, match="--measurement is for a loop without nodes"):
+    with pytest.raises(SelectionError, match=r"--measurement .*: give --command, too"):
         kind_of(given)
     given.measurement = None
-    with pytest.raises(SelectionError, match="--within is for a loop without nodes"):
+    with pytest.raises(
+        SelectionError, match=r"--within .*: give --measurement and --command, too"
+    ):
         kind_of(given)
     given.within = None
     assert kind_of(given) is Kind.NODES
@@ -687,7 +719,13 @@ def test_a_program_that_is_named_gets_gains_of_its_own_and_a_start_without_a_bum
 def test_somebody_without_a_controller_is_told_how_to_start_one(
     shown: Callable[..., str],
 ) -> None:
-    command = shown(None, "", "", bag="").partition("NEXT control with these gains ")[2].split()
+    both, _, rest = (
+        shown(None, "", "", bag="")
+        .partition("NEXT control with these gains ")[2]
+        .partition(" set-points for it ")
+    )
+    assert rest == "std_msgs/msg/Float64 on /setpoint"
+    command = both.split()
     assert command[command.index("--ros-args") - 1] == "controller_node"
     given = dict(word.split(":=", 1) for word in command if ":=" in word)
     assert given["controller_command"] == "/tank/valve"
@@ -699,7 +737,7 @@ def test_somebody_without_a_controller_is_told_how_to_start_one(
         e.name for e in CONTROLLER_PARAMETERS
     }
     # With a recording its folder keeps them, and the command is short.
-    short = shown(None, "", "").partition("NEXT control with these gains ")[2].split()
+    short = shown(None, "", "").partition(" set-points for it")[0].split()
     assert short[-3:-1] == ["controller_node", "--gains"]
     own, topics = yaml.safe_load(Path(short[-1]).read_text()).values()
     of_file = {name: str(value) for name, value in own["ros__parameters"].items()}
@@ -720,12 +758,20 @@ def test_somebody_without_a_controller_is_told_how_to_start_one(
     )
 
 
-@pytest.mark.parametrize("text", ["- kc: 1", "{kc: ", None])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "- kc: 1", "{kc: ", None, "kc: 1.0", "from simple_pid import PID\n\npid = PID(Kp=1.0)",
+        "/pid_controller:\n  ros__parameters:\n    gains:\n      joint:\n        p: 0.6",
+    ],
+)  # fmt: skip
 def test_a_file_of_gains_that_is_none_is_refused(text: str | None, tmp_path: Path) -> None:
     file = tmp_path / "gains.yaml"
     if text is not None:
         file.write_text(text)
-    with pytest.raises(ParameterError, match=r"--gains .*(expected|cannot be read)"):
+    with pytest.raises(
+        ParameterError, match=r"--gains .*(no kc of a controller_node; expected|cannot be read)"
+    ):
         with_gains_file(["--gains", str(file)])
 
 
