@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analysed import relay_record
+from analysed import analysed_once, relay_record
 from made_bags import (
     REPOSITORY,
     START,
@@ -52,6 +52,10 @@ def write_bag(path, folder, *records):
     return path
 
 
+# The choice among structures takes seconds.
+FOPDT = ("--structure", "fopdt")
+
+
 def run(capsys, *arguments) -> tuple[int, str, str]:
     status = replay.main([str(a) for a in arguments])
     out, err = capsys.readouterr()
@@ -73,7 +77,7 @@ def test_the_document_has_the_numbers_of_the_core_to_the_last_digit(tmp_path, ca
     (found,) = documents(out)
     assert found["bag"] == str(tmp_path / "bag")
     (experiment,) = found["experiments"]
-    expected = analyse(record)
+    expected = analysed_once(record)
     model, gains = expected.model, expected.best_gains
     selected = experiment["models"][experiment["selected"]]
     assert selected["method"] == "waveform"
@@ -151,10 +155,10 @@ def test_the_table_says_what_a_person_needs(tmp_path, capsys, monkeypatch):
 
 def test_two_experiments_are_two_entries_of_one_document(tmp_path, capsys):
     write_bag(tmp_path / "bag", tmp_path, relay_record(name="a"), relay_record(name="b"))
-    _, out, _ = run(capsys, "--json", "--structure", "fopdt", tmp_path / "bag")
+    _, out, _ = run(capsys, "--json", *FOPDT, tmp_path / "bag")
     (found,) = documents(out)
     assert [e["experiment_id"] for e in found["experiments"]] == ["a", "b"]
-    _, out, _ = run(capsys, "--structure", "fopdt", tmp_path / "bag")
+    _, out, _ = run(capsys, *FOPDT, tmp_path / "bag")
     assert "experiment 1 of 2" in out
     assert "experiment 2 of 2" in out
 
@@ -168,7 +172,7 @@ def test_an_experiment_that_did_not_end_well_has_a_model_but_no_gains(tmp_path, 
         tmp_path,
         relay_record(outcome=outcome, reason="the operator pressed the button"),
     )
-    status, out, _ = run(capsys, "--json", tmp_path / "bag")
+    status, out, _ = run(capsys, "--json", *FOPDT, tmp_path / "bag")
     (experiment,) = documents(out)[0]["experiments"]
     assert status == 1
     assert experiment["models"]
@@ -176,7 +180,7 @@ def test_an_experiment_that_did_not_end_well_has_a_model_but_no_gains(tmp_path, 
     assert experiment["recommended"] is None
     assert experiment["outcome"] == outcome.name.lower()
     assert experiment["reason"] == "the operator pressed the button"
-    status, out, err = run(capsys, tmp_path / "bag")
+    status, out, err = run(capsys, *FOPDT, tmp_path / "bag")
     assert status == 1
     assert (out + err).count("the operator pressed the button") == 1
     assert re.search(r"^  verdict +none$", out, re.M)
@@ -195,7 +199,7 @@ def test_a_bag_of_a_killed_node_gives_a_model_and_no_gains(tmp_path, capsys):
     bag = BagWriter(tmp_path / "bag", topics, start_ns=START, custom=facts)
     write_samples(bag, record)
     bag.flush()
-    status, out, err = run(capsys, "--json", tmp_path / "bag")
+    status, out, err = run(capsys, "--json", *FOPDT, tmp_path / "bag")
     (experiment,) = documents(out)[0]["experiments"]
     assert status == 1
     assert "unfinished recording" in err
@@ -213,7 +217,7 @@ def test_a_foreign_recording_of_a_relay(tmp_path, capsys):
         list(zip(record.time, record.command, strict=True)),
         ("/tank/level", "/tank/valve"),
     )
-    status, out, err = run(capsys, "--json", tmp_path / "bag")
+    status, out, err = run(capsys, "--json", *FOPDT, tmp_path / "bag")
     (experiment,) = documents(out)[0]["experiments"]
     assert status == 0
     assert "using --measurement /tank/level --command /tank/valve" in err
@@ -450,8 +454,9 @@ def process(*arguments, **options):
 
 def test_two_processes_print_the_same_bytes(tmp_path, capsys):
     bag = write_bag(tmp_path / "bag", tmp_path, relay_record())
-    other = process("--json", bag)
-    assert (other.returncode, other.stdout, other.stderr) == run(capsys, "--json", bag)
+    asked = ("--json", *FOPDT, bag)
+    other = process(*asked)
+    assert (other.returncode, other.stdout, other.stderr) == run(capsys, *asked)
 
 
 # All that is read or written otherwise: live, as a figure, by others, in IDL, to a bag.
@@ -482,7 +487,9 @@ def test_nothing_is_imported_that_a_bag_of_ours_does_not_need(tmp_path):
 
 def test_a_reader_that_leaves_early_gets_no_traceback(tmp_path):
     write_bag(tmp_path / "bag", tmp_path, relay_record())
-    command = f"{sys.executable} -m relay_autotune.cli.replay {tmp_path / 'bag'} | true"
+    command = (
+        f"{sys.executable} -m relay_autotune.cli.replay --structure fopdt {tmp_path}/bag | true"
+    )
     done = subprocess.run(
         ["bash", "-c", command], cwd=REPOSITORY, capture_output=True, text=True, timeout=120
     )

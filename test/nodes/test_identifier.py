@@ -133,6 +133,8 @@ def test_progress_is_answered_with_what_is_sought(
 ) -> None:
     told: list[Any] = []
     monkeypatch.setattr(node._models, "publish", told.append)
+    # The choice among structures takes seconds, and is not what this is about.
+    node.set_parameters([Parameter("structure", value="lag_n"), Parameter("order", value=2)])
     progress = experiment(0.0)
     progress.outcome = RelayExperiment.UNKNOWN
     progress.sought, progress.sought_width = "ms", 0.02
