@@ -580,7 +580,7 @@ class Code(enum.IntEnum):
         "wait for its end or call {node}/abort",
     )
     """Parameters hold for a whole tune."""
-    REST_UNKNOWN = _Row(317, "not known yet, since few samples have come")
+    REST_UNKNOWN = _Row(317, "not known yet: it takes 20 samples, and 2 s of them")
     """The node has just begun to hear the sensor."""
     STILL_MOVING = _Row(
         318,

@@ -295,7 +295,9 @@ class Readiness:
     def _heard(self) -> str:
         """Say who measures, and how."""
         topic, last = self._ends.measurement.topic_name, self._sensor.samples
-        rate = f"{1.0 / last.interval:.3g} per second" if last.interval > 0.0 else "rate not known"
+        rate = "rate not known yet"
+        if last.are_enough:
+            rate = f"{1.0 / last.interval:.3g} per second"
         newest = "" if last.newest is None else f", newest {last.newest:.6g} y"
         sources = ", ".join(map(described, self._node.get_publishers_info_by_topic(topic)))
         return f"{topic} from {sources}, {rate}{newest}"

@@ -127,7 +127,7 @@ class RelayNode(ServedNode):
         else:
             if not self._loop.is_driven:
                 self._answer_idle(value)
-            self._sensor.samples.add(value)
+            self._sensor.samples.add(value, info["source_timestamp"])
         if self._reported is not None:
             # After the answer: it belongs to this sample, and the one before is still needed.
             try:

@@ -36,6 +36,8 @@ _LEAST_WAIT = 1e-3
 _LOOK_EVERY = 0.2
 # The last samples that are kept, and the time that they may cover [s].
 _KEPT, _WINDOW = 2000, 10.0
+# The least time by which rest is told [s]: a drift shows in less only where it is fast.
+_LEAST_SPAN = 2.0
 # Rounding of equal times as floats of seconds since 1970 [s].
 _ROUNDING = 1e-6
 
@@ -147,25 +149,39 @@ class Repeater:
 
 
 class LastSamples:
-    """Keep the last measurements with their time of arrival."""
+    """Keep the last measurements with the times at which they were published.
+
+    Those of their arrival would tell how a node that has just started takes what waits for it.
+    """
 
     def __init__(self) -> None:
         self._kept: deque[tuple[float, float]] = deque(maxlen=_KEPT)
 
-    def add(self, value: float) -> None:
-        """Take a measurement [y] that has arrived now."""
-        self._kept.append((time.monotonic(), value))
+    def add(self, value: float, published_ns: int | None) -> None:
+        """Take a measurement [y].
+
+        :param value: the measurement.
+        :param published_ns: when it was published [ns]; None, 0: not known, so it is now.
+        """
+        self._kept.append((1e-9 * (published_ns or time.time_ns()), value))
 
     def forget(self) -> None:
         """Start again, since the command will change."""
         self._kept.clear()
 
     @property
+    def _span(self) -> float:
+        return self._kept[-1][0] - self._kept[0][0] if self._kept else 0.0
+
+    @property
+    def are_enough(self) -> bool:
+        """Whether they cover a time in which their rate, and whether they rest, can be told."""
+        return self._span >= _LEAST_SPAN or len(self._kept) == _KEPT
+
+    @property
     def interval(self) -> float:
         """Mean interval of the samples [s]; 0: not known."""
-        if len(self._kept) < 2:
-            return 0.0
-        return (self._kept[-1][0] - self._kept[0][0]) / (len(self._kept) - 1)
+        return max(self._span, 0.0) / max(len(self._kept) - 1, 1)
 
     @property
     def newest(self) -> float | None:
@@ -173,20 +189,19 @@ class LastSamples:
         return self._kept[-1][1] if self._kept else None
 
     def _recent(self) -> list[tuple[float, float]]:
-        since = time.monotonic() - _WINDOW
-        return [sample for sample in self._kept if sample[0] >= since]
+        """Return the samples of the last seconds, or the last 20 of a slow sensor."""
+        kept = list(self._kept)
+        recent = [sample for sample in kept if sample[0] >= kept[-1][0] - _WINDOW]
+        return recent if len(recent) >= CONSTANT_SAMPLES else kept[-CONSTANT_SAMPLES:]
 
     def before(self) -> list[float]:
-        """Return the measurements of the last seconds, or the last 20 of a slow sensor [y]."""
-        recent = self._recent()
-        if len(recent) < CONSTANT_SAMPLES:
-            recent = list(self._kept)[-CONSTANT_SAMPLES:]
-        return [value for _, value in recent]
+        """Return the recent measurements [y]."""
+        return [value for _, value in self._recent()]
 
     def rest(self) -> RestState | None:
-        """Return how the measurement rested over the last seconds; None: there are too few."""
+        """Return how the measurement rested recently; None: there are too few."""
         recent = np.array(self._recent())
-        if len(recent) < CONSTANT_SAMPLES:
+        if len(recent) < CONSTANT_SAMPLES or not self.are_enough:
             return None
         return rest_state(recent[:, 0] - recent[0, 0], recent[:, 1], len(recent))
 

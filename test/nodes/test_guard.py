@@ -14,6 +14,7 @@ import pytest
 from relay_autotune.nodes import watch
 from relay_autotune.nodes.watch import (
     FollowWatch,
+    LastSamples,
     Overtime,
     namesake,
     second_publisher,
@@ -189,3 +190,27 @@ def test_a_tune_ends_by_the_steady_clock(monkeypatch, rate, most, duration, expe
         why = look()
     found = why and (why.code, why[expected[1]])
     assert found == (expected and (expected[0], pytest.approx(expected[2], abs=0.1)))
+
+
+def samples_of(every: float, count: int) -> LastSamples:
+    """Return measurements of noise that a node took all at once, as after its start."""
+    samples = LastSamples()
+    for k in range(count):
+        samples.add(1.0 + 0.01 * (-1) ** k, 1_795_714_809_000_000_000 + round(1e9 * every * k))
+    return samples
+
+
+def test_the_rate_of_a_sensor_is_that_at_which_it_publishes():
+    assert samples_of(0.025, 100).interval == pytest.approx(0.025, rel=1e-3)
+    # Half a second is too short for rest.
+    few = samples_of(0.025, 20)
+    assert not few.are_enough and few.rest() is None
+    rest = samples_of(0.025, 100).rest()
+    assert rest is not None and rest.is_steady and rest.span == pytest.approx(2.475, abs=1e-5)
+
+
+@pytest.mark.parametrize(("every", "count", "span"), [(1e-4, 5000, 0.2), (1.0, 30, 19.0)])
+def test_rest_is_told_of_any_sensor_in_the_end(every, count, span):
+    """A fast one has no samples of 2 s among those that are kept, a slow one few in 10 s."""
+    rest = samples_of(every, count).rest()
+    assert rest is not None and rest.span == pytest.approx(span, rel=0.01)
