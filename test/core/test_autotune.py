@@ -35,20 +35,20 @@ def _record(seed: int = 0, noise: float = 0.02) -> Record:
 
 
 @cache
+def _told(method: str, rule: str) -> tuple[Analysis, list[str]]:
+    told: list[str] = []
+    return analyse(_record(), method=method, rule=rule, tell=told.append), told
+
+
 def _analysed(method: str = "waveform", rule: str = "robust") -> Analysis:
-    return analyse(_record(), method=method, rule=rule)
+    return _told(method, rule)[0]
 
 
 @pytest.mark.long
 def test_a_completed_experiment_yields_models_and_gains():
-    told: list[str] = []
-    found = analyse(_record(), tell=told.append)
+    found, told = _told("waveform", "robust")
     stages = "comparing structures", "comparing methods", "judging the model"
     assert told == [*stages, "designing the gains"]
-    # Equal records give equal numbers.
-    assert found.model.values.tolist() == _analysed().model.values.tolist()
-    assert found.model.covariance.tolist() == _analysed().model.covariance.tolist()
-    assert found.gains == _analysed().gains
     assert found.reason == ""
     assert found.model.method == "waveform"
     assert [m.method for m in found.models] == ["waveform", "wang_biased", "fourier"]
@@ -102,8 +102,11 @@ def test_alone_they_are_what_they_are_beside_others(method, rule):
 
 @pytest.mark.long
 def test_who_waits_for_the_gains_gets_the_same_ones():
-    beside = _analysed("waveform", "robust")
+    beside = _analysed()
     first = analyse(_record(), alone=True)
+    # Equal records give equal numbers.
+    assert first.model.values.tolist() == beside.model.values.tolist()
+    assert first.model.covariance.tolist() == beside.model.covariance.tolist()
     assert first.gains == (beside.best_gains,)
     assert first.judgement == beside.judgement
     assert len(first.models) == 1 < len(beside.models)

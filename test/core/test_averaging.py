@@ -28,7 +28,7 @@ _FOUND = identified("waveform", Estimate.of(FOPDT, _VALUES, np.diag((0.01 * _VAL
 
 @pytest.mark.long
 def test_draws_of_one_structure_give_its_own_deviation():
-    own = list(_FOUND.estimate.draws(4000, np.random.default_rng(1)))
+    own = list(_FOUND.estimate.draws(1000, np.random.default_rng(1)))
     stds = point_stds(_FOUND, own)
     expected = (_FOUND.ultimate_gain_std, _FOUND.ultimate_frequency_std)
     assert stds == pytest.approx(expected, rel=0.05)

@@ -6,18 +6,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.analysis import agreed, analyse
+from relay_autotune.identification.known import Known
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 from relay_autotune.result import Analysis
 from relay_autotune.verdict import Verdict
 
 
+@cache
 def part(gain: float, seed: int) -> Analysis:
     """Analyse a relay test of gain e^(-10 s)/(20 s + 1)."""
     settings = RelaySettings(
@@ -30,10 +33,11 @@ def part(gain: float, seed: int) -> Analysis:
     )
     noise = np.random.default_rng(seed).normal(0.0, 0.01, 900)
     model = TransferFunction.fopdt(gain, 20.0, 10.0)
-    return analyse(simulate_sampled_relay(model, settings, period=0.25, noise=noise), alone=True)
+    record = simulate_sampled_relay(model, settings, period=0.25, noise=noise)
+    return analyse(record, alone=True, known=Known(structure="fopdt"))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def first() -> Analysis:
     return part(1.65, 1)
 

@@ -135,7 +135,7 @@ def _staircase(seed: int = 0) -> tuple[np.ndarray, np.ndarray, Record]:
     times = np.cumsum(rng.uniform(2.0, 20.0, 15))
     u = PiecewiseConstant(times, rng.uniform(0.0, 3.0, 15), 1.0)
     # Irregular samples.
-    time = np.cumsum(rng.uniform(0.05, 0.7, 900))
+    time = np.cumsum(rng.uniform(0.05, 0.7, 500))
     y = 20.0 + response(TransferFunction.fopdt(1.2, 6.0, 2.345), time, u)
     return time, y, Record(time, y, u(time), held_input=u)
 
