@@ -49,7 +49,8 @@ ONCE_MORE = || { echo "$@: what failed runs once more, by itself"; \
 
 # running nodes, over real DDS, which wait much: three files at a time
 test-system: setup-tests
-	@$(ENTER) && { $(PYTEST) --numprocesses=3 --dist=loadfile test/system \
+	@$(ENTER) && { $(PYTEST) --numprocesses=3 --dist=loadfile --no-loadscope-reorder \
+		test/system \
 		$(ONCE_MORE) test/system; }; }
 
 test-rest: setup-tests

@@ -12,6 +12,16 @@ import pytest
 from loop_rig import Rig
 from ros_domain import free_domain
 
+# They take longest: begun last, each would run alone at the end.
+_FIRST = tuple(
+    f"test_{name}.py"
+    for name in ("faults", "guide", "joint", "remote_gains_kept", "new_loop", "tune_loop")
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.path.name not in _FIRST)
+
 
 @pytest.fixture
 def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
