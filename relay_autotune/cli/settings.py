@@ -274,6 +274,15 @@ class Answers:
                 "now": self.now(name),
             }
 
+    def lacking(self, names: Sequence[str]) -> list[str]:
+        """Return the questions of the settings that have no value yet and need one.
+
+        :param names: of the settings.
+        """
+        # An amplitude that is given is not searched for between the limits of the command.
+        free = ("command_within",) if self["amplitude"] else ()
+        return [SETTING[n].question for n in names if self[n] is None and n not in free]
+
     def parameters(self, names: Collection[str] = tuple(SETTING)) -> dict[str, Any]:
         """Return the parameters of relay_node that the known values set."""
         found: dict[str, Any] = {}

@@ -48,7 +48,7 @@ from relay_autotune.exchange.messages import (
 )
 from relay_autotune.experiment.early_end import ULTIMATE_GAIN
 from relay_autotune.identification.result import Identification
-from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.nodes.gains_client import GainsClient
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import process_text
@@ -220,6 +220,12 @@ class _LoopOnPage:
 
     def _check(self) -> None:
         """Ask whether a tune could start, and how."""
+        if lacking := self._loop.answers.lacking(self._loop.form):
+            self._live.rest(
+                f"fill in the plan first (Start a tune): {'; '.join(lacking)}",
+                good=False, checks=(), checked=self._live.told.checked + 1, accepted=False,
+            )  # fmt: skip
+            return
         self._live.tell(phase="checking", status="looking at the loop", tone="")
         result = self._client.check(self._options.amplitude)
         accepted = self._client.succeeded
@@ -259,7 +265,8 @@ class _LoopOnPage:
         if not result.experiment.experiment_id:
             live.rest(f"refused: {result.reason}", good=False)
             return NOTHING_FOUND
-        lines = result_lines(result, client.cancelled, Paint())
+        left = "" if result.outcome == result.COMPLETED else self._loop.left()
+        lines = result_lines(result, client.cancelled, Paint(), left=left)
         print("\n".join(lines), flush=True)
         live.tell(
             phase="analysing",
@@ -564,7 +571,10 @@ class GainsPage:
         live.rest(
             f"proof {'passed' if result.passed else 'failed'}: {result.reason}; {left}",
             good=result.passed,
-            proof=tuple(found_entries(result, proof.noise_std)),
+            proof=(
+                ("gains", _said(gains_from_message(message))),
+                *found_entries(result, proof.noise_std),
+            ),
         )
 
     def _message(self, wish: PageCommand) -> Any:
@@ -602,7 +612,11 @@ class GainsPage:
 def _said(gains: Controller | None) -> str:
     if gains is None:
         return "no gains; its command is held"
-    return f"kc {digits(gains.kc)} u/y, ti {digits(gains.ti)} s, td {digits(gains.td)} s"
+    told = f"kc {digits(gains.kc)} u/y, ti {digits(gains.ti)} s, td {digits(gains.td)} s"
+    if isinstance(gains, Gains) and gains.law:
+        # Under another law the same numbers are other gains.
+        told += f", {gains.law} every {gains.law_period:g} s"
+    return told
 
 
 def _document(step: Any) -> dict[str, Any]:

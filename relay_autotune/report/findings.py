@@ -250,13 +250,28 @@ def repeats_of(case: Case) -> tuple[NamedNumber, ...]:
 
 
 def warnings_of(case: Case) -> tuple[str, ...]:
-    """Return the sentences that must be read before anything else.
+    """Return the sentences that must be read before anything else; none where all is trusted.
 
     :param case: the experiment.
     """
-    doubtful = case.judgement.verdict is Verdict.DOUBTFUL
-    found = [f.said for f in case.judgement.findings if f.sentence] if doubtful else []
-    found += case.model.found.warnings if case.model is not None else ()
+    verdict = case.judgement.verdict
+    if verdict is Verdict.TRUSTED:
+        return ()
+    doubts = [f.said for f in case.judgement.findings if f.sentence]
+    return (*(doubts if verdict is Verdict.DOUBTFUL else ()), *_noted(case))
+
+
+def remarks_of(case: Case) -> tuple[str, ...]:
+    """Return what else is to be known of a result that is trusted.
+
+    :param case: the experiment.
+    """
+    return _noted(case) if case.judgement.verdict is Verdict.TRUSTED else ()
+
+
+def _noted(case: Case) -> tuple[str, ...]:
+    """Return what model, gains and cycles have to say beside the checks."""
+    found = list(case.model.found.warnings) if case.model is not None else []
     if case.best_gains is not None:
         found += case.best_gains.warnings
     disturbed = [c.index + 1 for c in case.cycles if c.disturbed]

@@ -25,6 +25,7 @@ from relay_autotune.report.findings import (
     doubts_of,
     facts_of,
     numbers_of,
+    remarks_of,
     repeats_of,
     steps_of,
     verdict_of,
@@ -120,7 +121,7 @@ def _environment() -> Environment:
     # What the page says of a case, each by the function that finds the words.
     said = (
         *(steps_of, beside_present, change_of, warnings_of, checks_of, numbers_of),
-        *(doubts_of, repeats_of),
+        *(remarks_of, doubts_of, repeats_of),
     )
     environment.globals |= {function.__name__: function for function in said}
     return environment

@@ -121,7 +121,8 @@ class Steps:
     :param command: u on the model, shape (n,).
     :param low: measurement that 2.5 % of the models around stay below, shape (n,) or (0,).
     :param high: that 97.5 % stay below.
-    :param load_time: instant of the step of the load [s].
+    :param load: height of the step of the load [u].
+    :param load_time: its instant [s].
     """
 
     time: FloatArray
@@ -129,6 +130,7 @@ class Steps:
     command: FloatArray
     low: FloatArray
     high: FloatArray
+    load: float
     load_time: float
 
 
@@ -367,7 +369,7 @@ def _steps(
         moving = ModelSet(task.around.models)(s).T[steady]
         runs = inverted(moving / (1.0 + law(s) * task.around(s).T[steady]) * steps, duration)
         low, high = np.quantile(runs, (0.025, 0.975), axis=0)
-    return Steps(setpoint.time, measurement, command, low, high, half)
+    return Steps(setpoint.time, measurement, command, low, high, load, half)
 
 
 def _curve(gains: Gains, shaping: Shaping) -> LoopCurve:

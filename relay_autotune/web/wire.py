@@ -26,6 +26,7 @@ from relay_autotune.report.findings import (
     compared_numbers,
     facts_of,
     performance_of,
+    remarks_of,
     verdict_of,
     warnings_of,
 )
@@ -185,6 +186,7 @@ def of_shaped(subject: PageModel, shaped: DesignResult) -> dict[str, Any]:
         if shaped.judgement.verdict is Verdict.DOUBTFUL
         else "",
         "warnings": notes,
+        "remarks": [visible(text) for text in remarks_of(case)],
         "isa": [[n, digits(v), unit, meaning] for n, v, unit, meaning in isa],
         "parallel": [[n, digits(v), unit] for n, v, unit in parallel],
         "effects": _effects(shaped),
@@ -198,6 +200,7 @@ def of_shaped(subject: PageModel, shaped: DesignResult) -> dict[str, Any]:
             "command": short(steps.command),
             "low": short(steps.low),
             "high": short(steps.high),
+            "load": digits(steps.load, 3),
             "load_time": steps.load_time,
         },
         "nyquist": {

@@ -39,6 +39,7 @@ from relay_autotune.cli.terminal import (
     number_of,
     pair_of,
 )
+from relay_autotune.cli.tune_page import _LoopOnPage
 from relay_autotune.control.verification import StepRange
 from relay_autotune.errors import LoopError, ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS, Target, exported
@@ -56,6 +57,7 @@ from relay_autotune.text import in_units
 from relay_autotune.tuning import design
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import Verdict
+from relay_autotune.web.live import Live
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains, Reason
 
@@ -475,6 +477,21 @@ def test_a_form_with_what_cannot_be_changes_nothing(changed: dict[str, Any]) -> 
     with pytest.raises(SelectionError):
         loop.set(changed)
     assert vars(given) == before
+
+
+def test_a_check_before_the_plan_is_filled_says_what_is_missing() -> None:
+    client: Any = Looker(measures=44.0)
+    client.check = None
+    loop = TopicLoop(client, options("--web", "--within", "30", "50"))
+    live = Live("tank")
+    shown: Any = _LoopOnPage.__new__(_LoopOnPage)
+    shown._loop, shown._live, shown._client, shown._options = loop, live, client, loop.options
+    shown._check()
+    assert "present command" in live.told.status and "command of the actuator" in live.told.status
+    assert "measurement" not in live.told.status and not live.told.accepted
+    # A given amplitude is not searched for between the limits of the command.
+    loop.options.amplitude, loop.options.at = 1.0, 2.0
+    assert loop.answers.lacking(loop.form) == []
 
 
 def test_a_form_that_can_be_goes_to_relay_node_as_numbers() -> None:

@@ -45,9 +45,15 @@ from relay_autotune.report.case import (
     true_value,
 )
 from relay_autotune.report.figures import PLATES
-from relay_autotune.report.findings import beside_present, change_of
+from relay_autotune.report.findings import (
+    beside_present,
+    change_of,
+    remarks_of,
+    warnings_of,
+)
 from relay_autotune.report.page import page
 from relay_autotune.report.style import COLOURS
+from relay_autotune.verdict import Verdict
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 HOSTILE = "<script>alert(1)</script>\"' onload=x <img src=q>"
@@ -177,6 +183,20 @@ def test_names_and_reasons_from_a_bag_are_text_and_never_html() -> None:
     assert "img" not in found.elements
     assert found.text.count("alert(1)") >= 8
     assert "&lt;script&gt;" in text
+
+
+@pytest.mark.parametrize("verdict", list(Verdict))
+def test_what_does_not_shake_the_verdict_does_not_head_the_page(
+    verdict: Verdict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = completed()
+    models = (replace(found.models[0], warnings=("a load step of -0.211 u",)), *found.models[1:])
+    case = replace(case_of(replace(found, models=models), "tank"), record=None, cycles=())
+    monkeypatch.setattr(type(case.judgement), "verdict", verdict)
+    heads, remarks = warnings_of(case), remarks_of(case)
+    assert ("a load step of -0.211 u" in remarks) is (verdict is Verdict.TRUSTED)
+    assert ("a load step of -0.211 u" in heads) is (verdict is not Verdict.TRUSTED)
+    assert "a load step of -0.211 u" in read(page([case])).text
 
 
 def test_without_gains_the_reason_stands_in_their_place() -> None:

@@ -84,8 +84,9 @@ def test_the_steps_are_those_of_an_exact_simulation(model):
     period = steps.load_time / 2000.0
     exact = simulate_closed_loop(
         gains, model, period=period, duration=2.0 * steps.load_time, setpoint=1.0,
-        load=shown_load(gains, model), load_time=steps.load_time,
+        load=steps.load, load_time=steps.load_time,
     )  # fmt: skip
+    assert steps.load == shown_load(gains, model)
     expected = np.interp(steps.time, exact.time, exact.measurement)
     assert np.max(np.abs(steps.measurement - expected)) < 0.02
     later = steps.time > 0.02 * steps.load_time
@@ -170,6 +171,7 @@ def test_an_aborted_experiment_gives_no_gains(analysis):
 def test_what_goes_to_the_browser_is_json_with_the_words_of_the_report(subject):
     shaped = subject.shaped(DesignRequest())
     document = json.loads(wire.to_text(wire.of_shaped(subject, shaped)))
+    assert float(document["steps"]["load"]) == pytest.approx(shaped.steps.load, rel=5e-3)
     assert document["isa"][0][:3] == ["kc", f"{shaped.gains.kc:.4f}", "u/y"]
     assert document["verdict"]["text"] == "gains ready to use"
     assert len(document["checks"]) == len(shaped.judgement.findings)

@@ -179,7 +179,7 @@ function showSteps(t) {
     bands: [{ x: t.time, low: t.low, high: t.high, kind: "", name: "95 % of the models" }].filter((b) => b.low.length),
     curves: [...before(1), { x: t.time, y: t.measurement, kind: "model", name: "the model" }],
     lines: [...load, { y: 1, kind: "setpoint" }],
-    said: `highest ${highest.toFixed(2)} after a set-point step of 1`,
+    said: `highest ${highest.toFixed(2)} after a set-point step of 1 y, then a load step of ${t.load} u`,
   });
   plots.command.draw({ xs: [0, end], curves: [...before(2), { x: t.time, y: t.command, kind: "input" }], lines: load });
 }
@@ -200,8 +200,10 @@ function showShaped(s, sketched) {
   if (!sketched) showBeside();
   $("why").textContent = `Rule ${s.rule}: ${s.reason}`;
   $("notes").hidden = !s.warnings.length;
-  $("warnings").replaceChildren();
-  for (const text of s.warnings) put($("warnings"), "li", text);
+  for (const id of ["warnings", "remarks"]) {
+    $(id).replaceChildren();
+    for (const text of s[id]) put($(id), "li", text);
+  }
   $("weight-value").textContent = s.b.toFixed(2);
   if (asked.setpoint_weight === null) $("weight").value = s.b;
   showSteps(s.steps);
