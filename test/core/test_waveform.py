@@ -308,6 +308,17 @@ def test_clean_records_have_no_outliers():
         assert not any("left out" in w for w in found.warnings)
 
 
+def test_a_step_of_a_coarse_sensor_is_no_spike():
+    """At rest nearly all samples are equal, so that the others look far off."""
+    rng = np.random.default_rng(0)
+    time = np.arange(0.0, 900.0, 0.5)
+    u = PiecewiseConstant(np.array([300.0, 600.0]), np.array([1.0, 0.0]), 0.0)
+    y = 40.0 + response(TransferFunction.sopdt(23.0, (60.0, 10.0), 6.0), time, u)
+    y = np.round((y + rng.normal(0.0, 0.08, time.size)) / 0.25) * 0.25
+    found = identify_waveform(Record(time, y, u(time), held_input=u), Known(structure="sopdt"))
+    assert not any("spikes" in w for w in found.warnings)
+
+
 @pytest.mark.long
 def test_a_record_that_begins_in_a_movement_and_ends_as_its_command_does():
     # What is left once the movement is over holds no change of the command that a sample follows,

@@ -27,7 +27,11 @@ from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.choice import chosen_fit
 from relay_autotune.identification.waveform.findings import report
-from relay_autotune.identification.waveform.fit_covariance import Fit, raw_residual
+from relay_autotune.identification.waveform.fit_covariance import (
+    Fit,
+    quantisation_step,
+    raw_residual,
+)
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import scale_of, weights
 from relay_autotune.identification.waveform.separable import (
@@ -263,7 +267,8 @@ def _outliers(whole: Problem, problem: Problem, state: Trial) -> NDArray[np.bool
     found = np.zeros(whole.time.size, dtype=bool)
     error = np.abs(state.residual - np.median(state.residual))
     width = scale_of(state.residual)
-    far = error > max(_OUTLIER * width, NEGLIGIBLE)
+    # A coarse sensor is now and then a step off, however narrow the bulk of its errors is.
+    far = error > max(_OUTLIER * width + quantisation_step(whole.y), NEGLIGIBLE)
     # Many of them, or several in a row, are not spikes but something that the model lacks.
     alone = far & ~np.roll(far, 1) & ~np.roll(far, -1)
     if width > NEGLIGIBLE and np.sum(far) == np.sum(alone) <= _MOST_OUTLIERS * found.size:
