@@ -530,7 +530,8 @@ def agreed(analyses: Sequence[Analysis]) -> tuple[Analysis, ...]:
 
     One process has one sign and one ultimate gain. Where two parts with gains differ in the sign,
     or the intervals of the ultimate gain do not meet, at least one of them is wrong, or the
-    process changed; nothing tells which part shows how it is now.
+    process changed; nothing tells which part shows how it is now. Gains of the wrong sign drive
+    the process to a limit: where the sign differs no part has gains.
 
     :param analyses: of all parts, in order.
     """
@@ -552,18 +553,19 @@ def agreed(analyses: Sequence[Analysis]) -> tuple[Analysis, ...]:
         value=value,
         unit="u/y",
         limit=0.0,
-        result=Result.DOUBTFUL,
+        result=Result.FAILED if math.isinf(value) else Result.DOUBTFUL,
         sentence=f"the parts of this recording contradict each other: the ultimate gain is {said}",
         remedy="take the part that shows the process as it is, with --start and --end, or test "
         "again",
     )
-    return tuple(
-        replace(
-            each,
-            judgement=replace(each.judgement, findings=(*each.judgement.findings, doubt)),
-        )
-        for each in analyses
-    )
+
+    def doubted(each: Analysis) -> Analysis:
+        judgement = replace(each.judgement, findings=(*each.judgement.findings, doubt))
+        if each.best_gains is not None and judgement.verdict is Verdict.NONE:
+            return _without_gains(each, judgement)
+        return replace(each, judgement=judgement)
+
+    return tuple(doubted(each) for each in analyses)
 
 
 def _gain(found: Identification) -> str:

@@ -51,12 +51,13 @@ def test_parts_that_agree_stay_as_they_are(first):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("gain", [2.5, -1.65])
-def test_of_parts_that_contradict_each_other_none_is_trusted(first, gain):
+@pytest.mark.parametrize(("gain", "verdict"), [(2.5, Verdict.DOUBTFUL), (-1.65, Verdict.NONE)])
+def test_of_parts_that_contradict_each_other_none_is_trusted(first, gain, verdict):
     other = part(gain, 2)
     assert other.verdict is Verdict.TRUSTED
     found = agreed((first, other, first))
-    assert {each.verdict for each in found} == {Verdict.DOUBTFUL}
+    assert {each.verdict for each in found} == {verdict}
+    assert {each.best_gains is None for each in found} == {verdict is Verdict.NONE}
     assert "contradict each other: the ultimate gain is" in found[0].judgement.reason
     assert "in part 1 and" in found[0].judgement.reason
 
