@@ -19,7 +19,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.record.record import PiecewiseConstant, Record, Unthinned, roughness
 
-# Largest number of samples of a record that is not thinned, and of blocks of a longer one.
+# Largest number of samples of a record that is not thinned, and number of blocks of a longer one.
 LEFT_ALONE = 10_000
 BLOCKS = 5_000
 # Largest number of changes of a command that is not averaged: each costs as much as a sample.
@@ -37,11 +37,11 @@ def thinned(record: Record) -> Record:
     """Return a record that is short enough to be analysed in bounded time and memory.
 
     Up to ``LEFT_ALONE`` samples it is the record itself. Of a longer one, blocks of equally many
-    samples are averaged into ``BLOCKS`` at most. Blocks begin at the changes of the command, so
+    samples are averaged into about ``BLOCKS``. Blocks begin at the changes of the command, so
     that switches stay where they were; the command itself stays exact if it changes seldom, and
     is averaged between the blocks' beginnings if it changes often. Where a response is too fast
     for such blocks, they are made smaller, and only the part of the record about the first
-    changes of the command is used.
+    changes of the command is used, ``LEFT_ALONE`` blocks at most.
 
     :param record: any record.
     """
@@ -55,8 +55,9 @@ def thinned(record: Record) -> Record:
     size = _slow_enough(record.measurement, wanted, white=often)
     part, said = record, ""
     if size < wanted:
-        low = _before_first(record, changes, size * room)
-        part = record.part(low, min(low + size * room, n))
+        length = size * LEFT_ALONE
+        low = _before_first(record, changes, length)
+        part = record.part(low, min(low + length, n))
         changes = _changes(part)
         often = changes.size > _MOST_CHANGES
         begun = float(record.time[low] - record.time[0])
