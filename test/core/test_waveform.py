@@ -20,7 +20,11 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.separable import TRIAL, evaluate, problem_of, refine
-from relay_autotune.identification.waveform.starts import latest_dead_time, multistart
+from relay_autotune.identification.waveform.starts import (
+    latest_dead_time,
+    multistart,
+    start_fopdt,
+)
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import RelayRun, simulate_relay
 from relay_autotune.process.structures import TABLE
@@ -372,6 +376,18 @@ def test_a_structure_of_which_no_fit_can_begin_is_left_out():
     # One of those that are fitted whatever others promise.
     problem = problem_of([told], TABLE["fopdt"])
     assert multistart(problem, [], 1e-6) is None
+
+
+def test_few_samples_do_not_meet_a_periodic_command_at_one_instant_each_time():
+    """Each 17th sample, of which the few would be taken, comes half a period after the last."""
+    rng = np.random.default_rng(1)
+    time = 0.003 * np.arange(4000)
+    switches = np.arange(0.0, 12.0, 17 * 0.003)
+    u = PiecewiseConstant(switches, np.resize([1.0, -1.0], switches.size), 0.0)
+    y = response(TransferFunction.fopdt(1.0, 0.005, 0.0014), time, u)
+    y += rng.normal(0.0, 0.02, time.size)
+    log_tau, _ = start_fopdt(problem_of([(time, y, u)], TABLE["fopdt"]))[0]
+    assert 0.003 < math.exp(log_tau) < 0.008
 
 
 def test_a_fit_ends_where_lags_far_below_the_period_explain_nothing_more():

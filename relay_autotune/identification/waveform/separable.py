@@ -46,6 +46,8 @@ _GROWTH = 4.0
 # Longest lag in lengths of the record: a slower one is an integrator to a thousandth.
 _LONGEST = 1e3
 _WEAK = 1e-11
+# The fractional parts of its multiples are spread evenly, without a period (Weyl 1916).
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 # Range of a rest, in steps of the sensor, in which nothing moves.
 _A_STEP = 1.5
 
@@ -271,19 +273,24 @@ class Problem:
             weight=None if self.weight is None else self.weight[chosen],
         )
 
-    def thinned(self, most: int) -> Problem:
+    def thinned(self, most: int, *, scattered: bool = False) -> Problem:
         """Return the problem of evenly spaced samples.
 
         :param most: largest number to keep, of all experiments together.
+        :param scattered: True: one out of each such space, anywhere in it. Evenly spaced ones may
+            meet a command that repeats itself at the same instant each time.
         """
         share = max(most // len(self.bounds), 1)
-        parts = self.experiments
-        steps = [-(-(part.stop - part.start) // share) for part in parts]
-        if len(parts) == 1:
-            return self if steps[0] == 1 else self.part(slice(None, None, steps[0]))
+        if all(part.stop - part.start <= share for part in self.experiments):
+            return self
         chosen = np.zeros(self.time.size, dtype=bool)
-        for part, step in zip(parts, steps, strict=True):
-            chosen[part][::step] = True
+        for part in self.experiments:
+            step = -(-(part.stop - part.start) // share)
+            at = np.arange(part.start, part.stop, step)
+            if scattered:
+                away = (step * (_GOLDEN * np.arange(at.size) % 1.0)).astype(np.int64)
+                at = np.minimum(at + away, part.stop - 1)
+            chosen[at] = True
         return self.part(chosen)
 
 

@@ -280,7 +280,7 @@ def start_fopdt(problem: Problem, sign: int = 0) -> list[FloatArray]:
     :param sign: of the gain, 1 or -1; 0: not known.
     """
     shortest, longest = time_scales(problem)
-    few = coarse(problem)
+    few = problem.thinned(_GRID_SAMPLES, scattered=True)
     taus = np.geomspace(0.5 * min(shortest, 0.1 * longest), 30.0 * longest, 14)
     dead_times = longest * np.array(_SHARES)
     latest = latest_dead_times(problem, sign)
