@@ -344,6 +344,18 @@ class _Density:
                 break
         return here
 
+    def log_mass(self, mode: _Point, variance: float) -> float:
+        """Return the logarithm of the probability about a mode, by Laplace's approximation.
+
+        A narrow peak, as where a late response would follow the noise of a few samples, may be
+        higher than a plain of models and yet hold less than it.
+
+        :param mode: most likely point near some place.
+        :param variance: of the noise, for all modes that are compared.
+        """
+        _, values, _ = self.axes_at(mode)
+        return -0.5 * (mode.cost(variance) + float(np.sum(np.log1p(values**2))))
+
     def draws(self, here: _Point, count: int, rng: np.random.Generator) -> Iterator[_Point | None]:
         """Yield points by Laplace's approximation; None: the density is less than it says."""
         axes, values, _ = self.axes_at(here)
@@ -389,14 +401,16 @@ def _allowed(
     length = float(np.ptp(problem.time))
     centre = _within_the_record(structure, _point_of(gain, theta), length)
     density = _Density(problem, centre, deviation, noise)
-    here = start = density.about(centre, math.copysign(1.0, gain[0]))
+    start = density.about(centre, math.copysign(1.0, gain[0]))
+    places = [start]
     # The best fit without the prior may be nearer, but also run off where samples tell little.
     own = refine(problem, theta, tolerance=TRIAL, most=_STEPS)
     if own.coefficients[0] != 0.0:
         at = _point_of(own.coefficients[:k], own.theta)
-        elsewhere = density.about(at, math.copysign(1.0, own.coefficients[0]))
-        here = min(here, elsewhere, key=lambda p: p.cost(start.variance))
-    here = density.most_likely(here)
+        places.append(density.about(at, math.copysign(1.0, own.coefficients[0])))
+    modes = [density.most_likely(place) for place in places]
+    variance = min(mode.variance for mode in modes)
+    here = max(modes, key=lambda mode: density.log_mass(mode, variance))
     models: list[TransferFunction] = []
     values: list[FloatArray] = []
     for point in itertools.islice(density.draws(here, count, rng), _TRIES * count):
