@@ -94,7 +94,7 @@ def begins_at_rest(time: FloatArray, y: FloatArray, u: Input) -> bool:
     """
     changes = u.times[(u.times >= time[0]) & (u.times < time[-1])]
     before = time < (changes[0] if changes.size else time[0])
-    if np.count_nonzero(before) < _ENOUGH_REST:
+    if np.count_nonzero(before) < _ENOUGH_REST or not np.ptp(time[before]) > 0.0:
         return False
     t, wide = time[before] - float(np.mean(time[before])), float(np.ptp(y))
     slope = float(t @ y[before]) / float(t @ t)

@@ -65,6 +65,13 @@ def relay_test(noise, load, cycles=8) -> Record:
     )
 
 
+@pytest.mark.parametrize("residual", [np.ones(200), np.tile([1.0, -1.0], 100)])
+def test_a_residual_that_repeats_itself_has_a_finite_colour(residual):
+    colour = colour_of([residual])
+    assert np.all(np.isfinite(colour.whitened(residual)))
+    assert math.isfinite(colour.log_determinant)
+
+
 @pytest.mark.parametrize("pole", [0.5, 0.9, 0.98])
 def test_the_colour_of_an_autoregression_is_found(pole):
     rng = np.random.default_rng(1)

@@ -46,6 +46,9 @@ def test_the_command_at_which_a_process_rests_before_its_test():
     # It moves from a step before, or begins with its step.
     assert math.isnan(resting_command(whole.part(400, len(whole))))
     assert math.isnan(resting_command(commanded([0.0], [30, 40])))
+    # A clock in coarse steps stamps many samples with one time: that is no rest.
+    coarse = commanded([3.0], [30, 40], time=np.repeat(np.arange(0.0, 50.0, 5.0), 30))
+    assert math.isnan(resting_command(coarse))
 
 
 def test_a_step_with_rest_ten_times_as_long_as_itself_around_it():

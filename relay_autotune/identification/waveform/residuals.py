@@ -131,6 +131,8 @@ def mean_slope(residual: FloatArray, scale: float, loss: str) -> float:
 _MOST_LAGS = 24
 # Least number of samples for each further lag.
 _SAMPLES_EACH = 12
+# Largest correlation of neighbours that rounding can tell from 1.
+_CERTAIN = 1.0 - 1e-12
 
 
 @dataclass(frozen=True)
@@ -204,12 +206,13 @@ def colour_of(parts: Sequence[FloatArray], most: int = _MOST_LAGS) -> Colour | N
         down = sum(float(f @ f + b @ b) for f, b in zip(ahead, behind, strict=True))
         if not down > 0.0:
             break
-        k = top / down
+        # A residual that repeats itself to rounding would leave no variance at all.
+        k = max(-_CERTAIN, min(top / down, _CERTAIN))
         reflections.append(k)
         a = np.concatenate((a - k * a[::-1], [k]))
         forward = [f - k * b for f, b in zip(ahead, behind, strict=True)]
         backward = [b - k * f for f, b in zip(ahead, behind, strict=True)]
-        variance *= max(1.0 - k * k, 1e-300)
+        variance *= 1.0 - k * k
         criterion = n * math.log(variance) + order * math.log(n)
         if criterion < best:
             best, chosen = criterion, a
