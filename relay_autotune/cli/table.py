@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relay_autotune.cli.terminal import NARROWEST, WIDEST, broken, in_columns, labelled
-from relay_autotune.loop.analysis import difference, performance_on
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import limit_cycle
@@ -165,6 +164,9 @@ def beside(
     :param width: columns that a line may have.
     :param head: what stands above the present gains.
     """
+    # here, for it loads scipy: a tune is shown with this module, and begins before that
+    from relay_autotune.loop.analysis import difference, performance_on
+
     now = None if present is None else performance_on(present, model)
     rows = [["", head, "new", ""]]
     for name, unit in _FIGURES:
