@@ -37,6 +37,7 @@ from relay_autotune.record.record import (
     Record,
     RelaySettings,
 )
+from relay_autotune.text import is_unit
 
 
 @dataclass(frozen=True)
@@ -178,7 +179,8 @@ def _of_pair(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]
             f"the clocks behind {names[0]} and {names[1]} differ by {difference / 1e9:.3f} s; "
             f"they are aligned by the recorder's clock"
         )
-    record = join(signals[0], preceded(signals[1], wanted.command_before))
+    units = {letter: topics.unit(name) for letter, name in zip("yu", names, strict=True)}
+    record = _in_units(join(signals[0], preceded(signals[1], wanted.command_before)), units)
     records, found = _taken_apart(record, whole=wanted.is_part)
     return records, [*notes, *found]
 
@@ -228,7 +230,7 @@ def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
         notes += log.notes
         try:
             command = preceded(log.command, wanted.command_before)
-            record = join(log.measurement, command, dated=log.dated)
+            record = _in_units(join(log.measurement, command, dated=log.dated), log.units)
             found, said = _taken_apart(record, whole=wanted.is_part)
         except BagError as fault:
             faults.append(fault)
@@ -238,6 +240,11 @@ def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
     if not records:
         raise faults[0]
     return records, [*notes, *(f"one of the recordings is left out: {f}" for f in faults)]
+
+
+def _in_units(record: Record, units: Mapping[str, str]) -> Record:
+    """Return a record with those of its units that are told."""
+    return replace(record, units={name: unit for name, unit in units.items() if is_unit(unit)})
 
 
 def read_records(

@@ -20,7 +20,7 @@ from relay_autotune.loop.gains import Gains
 from relay_autotune.process.transfer_function import process_mathml, process_text
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Cycle, Record
-from relay_autotune.text import digits, plus_minus
+from relay_autotune.text import digits, in_units, plus_minus
 from relay_autotune.tuning.ensemble import PredictedMs, ensemble_peaks
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import NOT_JUDGED, Finding, Judgement, Verdict, judge
@@ -163,7 +163,7 @@ def _text(analysis: Analysis) -> str:
         rows += [row for row in _gains_rows(analysis.best_gains) if row[0] != "parallel form"]
     if analysis.reason:
         rows.append(("reason", analysis.reason))
-    lines = [f"  {label:<9} {text}" for label, text in rows]
+    lines = [f"  {label:<9} {in_units(text, analysis.record.units)}" for label, text in rows]
     return "\n".join([f"<Analysis of {analysis.record!r}", *lines]) + ">"
 
 
@@ -184,7 +184,7 @@ def _html(analysis: Analysis) -> str:
         rows.append(("reason", html.escape(analysis.reason)))
     cells = "".join(
         f'<tr><th style="text-align: left">{name}</th>'
-        f'<td style="text-align: left">{value}</td></tr>'
+        f'<td style="text-align: left">{in_units(value, analysis.record.units)}</td></tr>'
         for name, value in rows
     )
     return f"<table>{cells}</table>"

@@ -95,7 +95,7 @@ def cell(text: str) -> str:
 
 
 # Where y and u stand for units: in a quotient, behind a number, or in brackets.
-_QUOTIENT = re.compile(r"(?<![\w/])(u/\(y s\)|y/\(u s\)|u s/y|y s/u|u/y|y/u)(?![\w/])")
+_QUOTIENT = re.compile(r"(?<![\w/])(u/\(y s\)|y/\(u s\)|u s/y|y s/u|u/y|y/u|y/s)(?![\w/])")
 _SINGLE = re.compile(r"(?<=\d )([yu])(?![\w/(])|(?<=\[)([yu])(?=[\],])")
 
 
@@ -121,6 +121,19 @@ def in_units(text: str, units: Mapping[str, str]) -> str:
 
     text = _QUOTIENT.sub(quotient, text)
     return _SINGLE.sub(lambda found: units.get(found[0], found[0]), text)
+
+
+# A unit has no blank, and a letter or one of these signs.
+_UNIT_ALONE = re.compile(r"(?=.*[^\W\d_]|[%°])[\w%°/^*·.-]{1,12}\Z")
+
+
+def is_unit(text: str) -> bool:
+    """Return whether a text may stand for y or u.
+
+    >>> is_unit("m³/h"), is_unit("%"), is_unit("left hand side"), is_unit("1")
+    (True, True, False, False)
+    """
+    return _UNIT_ALONE.match(text) is not None
 
 
 _UNIT_BEHIND = re.compile(r"(?<=[\d\s])([%°][a-zA-Z]*|[^\W\d_][\w/^*]*)\s*[)\]]?$")

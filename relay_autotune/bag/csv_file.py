@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -82,12 +82,14 @@ class Log:
     :param measurement: the samples.
     :param command: what was commanded.
     :param dated: whether the times are since the epoch.
+    :param units: of the measurement, by "y", and of the command, by "u", as far as they are told.
     :param notes: what was guessed or left out, each a sentence.
     """
 
     measurement: Signal
     command: Signal
     dated: bool
+    units: Mapping[str, str]
     notes: tuple[str, ...] = ()
 
 
@@ -167,6 +169,9 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
         time_ns, dated = _nanoseconds(path, name, times, unit, notes)
         if wanted.time is None and not _is_time(name):
             _check_rises(path, name, time_ns)
+    units = {
+        n: table.units.get(name) or _in_brackets(name) for n, name in zip("yu", names, strict=True)
+    }
     bounds = _recordings(time_ns)
     if len(bounds) > 2:
         lines = ", ".join(str(table.lines[at]) for at in bounds[1:-1])
@@ -177,7 +182,8 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
     logs = []
     for first, last in pairwise(bounds):
         part = slice(first, last)
-        logs.append(_log(names, time_ns[part], (y[part], u[part]), dated, notes))
+        log = _log(names, time_ns[part], (y[part], u[part]), dated, notes)
+        logs.append(replace(log, units=units))
         notes = []
     return tuple(logs)
 
@@ -218,7 +224,7 @@ def _log(
                 f"the longest gap is {gap / 1e9:.6g} s"
             )
         signals.append(Signal(name, time_ns[there], ordered[there]))
-    return Log(signals[0], signals[1], dated, tuple(notes))
+    return Log(signals[0], signals[1], dated, {}, tuple(notes))
 
 
 def _spread(time_ns: IntArray) -> tuple[IntArray, float]:
@@ -310,11 +316,15 @@ def _unwrapped(time: FloatArray, name: str, notes: list[str]) -> FloatArray:
 
 def _unit_of(name: str) -> str | None:
     """Return the unit that a name ends with, in brackets or as its last word."""
-    match = _UNIT.search(name)
-    if match:
-        return match["unit"]
+    if unit := _in_brackets(name):
+        return unit
     last = re.split(r"[\W_]+|(?<=[a-z])(?=[A-Z])", name.strip())[-1]
     return last if last.lower() in _UNITS else None
+
+
+def _in_brackets(name: str) -> str:
+    match = _UNIT.search(name)
+    return match["unit"] if match else ""
 
 
 def _check_rises(path: Path, name: str, time_ns: IntArray) -> None:

@@ -22,7 +22,14 @@ from relay_autotune.bag.arrays import FloatArray, IntArray
 from relay_autotune.bag.bag_file import BagFile
 from relay_autotune.bag.cdr import Path, decode_messages, decoded_message
 from relay_autotune.bag.definitions import message_type
-from relay_autotune.bag.field_path import Struct, Type, first_numbers, some_numbers, steps_of
+from relay_autotune.bag.field_path import (
+    Struct,
+    Type,
+    first_numbers,
+    some_numbers,
+    steps_of,
+    unit_of_field,
+)
 from relay_autotune.bag.limits import MOST_DEFINITIONS, MOST_EXPECTED
 from relay_autotune.bag.mcap_records import Channel, Messages
 from relay_autotune.bag.signals import SignalReader, TimedSignal
@@ -140,6 +147,14 @@ class Topics:
                 if len(found) == count:
                     return found
         return found
+
+    def unit(self, name: str) -> str:
+        """Return the unit that the type of a signal's messages says; empty: it says none.
+
+        :param name: ``TOPIC`` or ``TOPIC:FIELD``.
+        """
+        topic, field = split_name(name)
+        return unit_of_field(self.types()[topic], field or only_field(self.root_of(topic)) or "")
 
     def single_numbers(self) -> list[str]:
         """Return the topics whose messages are about one number."""

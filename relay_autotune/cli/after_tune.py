@@ -19,7 +19,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ from relay_autotune.cli.own_nodes import (
 )
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import (
+    UNITS,
     StatusLine,
     Working,
     agreed_step,
@@ -366,7 +367,7 @@ class AfterTune:
             with Working("writing the report"):
                 record, source = client.record(PATIENCE), result.bag or self.loop.title
                 told = report_of_tune(
-                    record,
+                    replace(record, units=dict(UNITS)),
                     values or defaults(),
                     result,
                     source,

@@ -222,8 +222,10 @@ def _exported(
 
 
 def _from_rest(target: Target, record: Record | None) -> Target:
-    """Return where gains go with the command at which a record rests, if it does."""
-    return target if record is None else replace(target, present=resting_command(record))
+    """Return where gains go with units, and the command at which a record rests, if it does."""
+    if record is None:
+        return target
+    return replace(target, present=resting_command(record), units=record.units)
 
 
 def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> str:
@@ -539,4 +541,7 @@ def show(
     subjects = [subject(case, shaping) for case, shaping in models]
 
     page = Page(subjects, address_of(options.web_address))
+    units = [case.units for case, _ in models]
+    if all(each == units[0] for each in units):
+        page.units = units[0]
     run(page, lambda url: say(program, f"the page is at {url} until Ctrl-C"))

@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from relay_autotune.bag.field_path import first_numbers
+from relay_autotune.bag.field_path import first_numbers, unit_of_field
 from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, ros_arguments
 from relay_autotune.cli.settings import Answers, as_flags, flag_to_give
 from relay_autotune.cli.terminal import UNITS, Working, asked, broken, width
@@ -174,7 +174,7 @@ class TopicLoop(Loop):
 
     def __init__(self, client: TuneClient, options: argparse.Namespace) -> None:
         # Imported here, because it needs ROS.
-        from relay_autotune.nodes.live_types import CommandMessage, unit_of_field
+        from relay_autotune.nodes.live_types import CommandMessage
 
         super().__init__(client, options)
         answers, measurement, command = self.answers, options.measurement, options.command
@@ -357,4 +357,6 @@ class TopicLoop(Loop):
         at = math.nan if self.options.at is None else self.options.at
         topics = {"measurement": self.options.measurement}
         topics["controller_command"] = self.options.command
-        return Target(command_min=low, command_max=high, present=at, topics=topics)
+        return Target(
+            command_min=low, command_max=high, present=at, topics=topics, units=dict(UNITS)
+        )

@@ -12,12 +12,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from relay_autotune.cli.terminal import NARROWEST, WIDEST, broken, in_columns, labelled
+from relay_autotune.cli.terminal import (
+    NARROWEST,
+    UNITS,
+    WIDEST,
+    broken,
+    in_columns,
+    labelled,
+    told_in,
+)
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Outcome, Record
-from relay_autotune.text import date_text, digits, plus_minus
+from relay_autotune.text import date_text, digits, in_units, plus_minus
 from relay_autotune.verdict import Judgement, Result, Verdict
 
 if TYPE_CHECKING:
@@ -50,12 +58,13 @@ def table(
     blocks = [bag]
     for number, analysis in enumerate(analyses, start=1):
         which = f" {number} of {len(analyses)}" if len(analyses) > 1 else ""
-        blocks.append("\n".join(_laid_out(_experiment(analysis, which), width)))
-        model, gains = analysis.model, analysis.best_gains
-        if present is not None and model is not None and gains is not None:
-            slower = model.model.dead_time + analysis.added_delay
-            process = replace(model.model, dead_time=slower)
-            blocks.append("\n".join(beside(present, gains, process, width, head="present")))
+        with told_in(analysis.record.units):
+            blocks.append("\n".join(_laid_out(_experiment(analysis, which), width)))
+            model, gains = analysis.model, analysis.best_gains
+            if present is not None and model is not None and gains is not None:
+                slower = model.model.dead_time + analysis.added_delay
+                process = replace(model.model, dead_time=slower)
+                blocks.append("\n".join(beside(present, gains, process, width, head="present")))
     return "\n\n".join(blocks) + "\n"
 
 
@@ -252,7 +261,7 @@ def _limit_cycle(analysis: Analysis) -> list[_Entry]:
             f"period {digits(cycle.period)} s (high {digits(cycle.period_high)} s, "
             f"low {digits(cycle.period_low)} s), {_count(len(cycle.cycles))}, {state}",
         ),
-        ("", f"measurement {digits(cycle.peak_min)} to {digits(cycle.peak_max)}"),
+        ("", f"measurement {digits(cycle.peak_min)} to {digits(cycle.peak_max)} y"),
     ]
 
 
@@ -406,7 +415,7 @@ def _step(does: Performance) -> str:
 
 
 def _row(label: str, value: float, unit: str, interval: str) -> _Entry:
-    return f"  {label}", f"{digits(value):>9} {unit:<6} {interval}".rstrip()
+    return f"  {label}", f"{digits(value):>9} {in_units(unit, UNITS):<6} {interval}".rstrip()
 
 
 def _process(label: str, model: TransferFunction, note: str) -> list[_Entry]:

@@ -16,7 +16,7 @@ import termios
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,6 +40,22 @@ _GAP = "   "
 
 UNITS: dict[str, str] = {}
 """What y and u stand for in this process, as far as its loop is known."""
+
+
+@contextmanager
+def told_in(units: Mapping[str, str]) -> Iterator[None]:
+    """Tell of another loop in the block.
+
+    :param units: of its measurement, by "y", and of its command, by "u", as far as known.
+    """
+    before = dict(UNITS)
+    UNITS.clear()
+    UNITS.update(units)
+    try:
+        yield
+    finally:
+        UNITS.clear()
+        UNITS.update(before)
 
 
 def width() -> int:

@@ -362,7 +362,7 @@ class _LoopOnPage:
     def _add_subject(self, result: Any) -> None:
         """Show the model of the tune, and let its gains be shaped; other rules come later."""
         try:
-            record = self._client.record(_PATIENCE)
+            record = replace(self._client.record(_PATIENCE), units=dict(UNITS))
             values = self._client.identifier_values(_PATIENCE) or defaults()
             found = _awaited(
                 self._client,

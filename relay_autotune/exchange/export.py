@@ -21,6 +21,7 @@ from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.loop.gains import Gains
 from relay_autotune.loop.laws import LAWS, OWN_LAW, Law
 from relay_autotune.quantities import result_fields
+from relay_autotune.text import in_units
 
 _DIGITS = 10
 # Gains that are for no law in particular can be exported for this one.
@@ -44,6 +45,7 @@ class Target:
     :param command_max: upper clamp of the command [u]; inf: none.
     :param present: the command at which the process rests [u]; NaN: not known.
     :param topics: names of the topics of a controller_node, by their names without a remapping.
+    :param units: of the measurement, by "y", and of the command, by "u", as far as known.
     :param is_set_up: True if the gains are for its rate and its strategy against windup, which a
         joint_trajectory_controller cannot change while it runs.
     :raises SelectionError: if a name cannot be that of a node or parameter, or a clamp is NaN or
@@ -56,6 +58,7 @@ class Target:
     command_max: float = math.inf
     present: float = math.nan
     topics: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
     is_set_up: bool = False
 
     def __post_init__(self) -> None:
@@ -81,17 +84,25 @@ def exported(gains: Gains, how: str, target: Target, *, doubt: str = "") -> str:
     :param doubt: what to look at before they are used; empty: they are trusted.
     :raises SelectionError: if they are for another law.
     """
+    text = in_units(_file(gains, how, target), target.units)
+    if not doubt:
+        return text
+    return (
+        f"{LAWS[how].remark if how in LAWS else '#'} DOUBTFUL: {' '.join(doubt.split())}\n{text}"
+    )
+
+
+def _file(gains: Gains, how: str, target: Target) -> str:
     if how == "yaml":
-        return _doubted(plain(gains), doubt, "#")
+        return plain(gains)
     if how == LAUNCH and gains.law in ("", OWN_LAW):
-        return _doubted(launch_file(gains, target), doubt, "#")
+        return launch_file(gains, target)
     if how not in ((gains.law,) if gains.law else (WITHOUT_LAW, OWN_LAW)):
         runs = gains.law or "controller_node, as a continuous controller"
         raise SelectionError(f"the gains are for {runs}: give --law {how} to export them for it")
     law = LAWS[how]
     written = parameters if law.sets_gains else settings
-    text = written(gains, law, target)
-    return _doubted(text, doubt, law.remark)
+    return written(gains, law, target)
 
 
 def exports_of(law: str) -> tuple[str, ...]:
@@ -109,10 +120,6 @@ def file_name(how: str) -> str:
     :param how: as of :func:`exported`.
     """
     return f"{how}.{LAWS[how].ending}" if how in LAWS else _FILES[how]
-
-
-def _doubted(text: str, doubt: str, remark: str) -> str:
-    return f"{remark} DOUBTFUL: {' '.join(doubt.split())}\n{text}" if doubt else text
 
 
 def parameters(gains: Gains, law: Law, target: Target) -> str:
@@ -150,19 +157,25 @@ def settings(gains: Gains, law: Law, target: Target) -> str:
     :param law: the law.
     :param target: with the clamps of the command, which become a remark.
     """
-    limits = (target.command_min, target.command_max)
+    low, high = limits = (target.command_min, target.command_max)
+    of_command = "" if law.command == "any" else f" Its command is the {law.command}."
     if law.unset and not all(map(math.isfinite, limits)):
-        raise SelectionError(
-            f"{law.name} always limits its command, and to {law.unset} where nothing else is set: "
-            "give the lowest and the highest command, --command-min and --command-max of replay "
-            "or tune"
+        if target.units.get("u") != "%":
+            raise SelectionError(
+                f"{law.name} always limits its command, and to {law.unset} where nothing else is "
+                "set: give the lowest and the highest command, --command-min and --command-max of "
+                "replay or tune"
+            )
+        limits = (max(low, 0.0), min(high, 100.0))
+        of_command = " Its command is in %, from {:g} to {:g}: scale it for the output.".format(
+            *limits
         )
     where = ""
     if law.bounds is None:
-        low, high = (f"{limit:g}" if math.isfinite(limit) else "none" for limit in limits)
-        set_there = f"; set them to {low} and {high}" if any(map(math.isfinite, limits)) else ""
+        ends = (f"{limit:g}" if math.isfinite(limit) else "none" for limit in limits)
+        known = any(map(math.isfinite, limits))
+        set_there = f"; set them to {' and '.join(ends)}" if known else ""
         where = f"Limits of the command are set in the program{set_there}. "
-    of_command = "" if law.command == "any" else f" Its command is the {law.command}."
     told: tuple[str, ...] = (
         f"For {law.program}.{of_command}",
         f"{where}At the limits of the command: {law.limits}.",

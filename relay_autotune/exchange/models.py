@@ -265,6 +265,7 @@ def _experiment(analysis: Analysis) -> dict[str, Any]:
         "outcome": record.outcome.name.lower(),
         "reason": _reason(analysis),
         "experiment_id": record.experiment_id,
+        "units": dict(record.units),
         "samples": len(record),
         "lost_samples": record.lost_samples,
         "relay": None if settings is None else to_document(settings),

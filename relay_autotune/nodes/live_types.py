@@ -73,28 +73,6 @@ def reader_of(type_name: str, field: str, parameter: str = "measurement_field") 
     return Reader(kind, type_name, _data if is_plain else reading(steps), stamp)
 
 
-# Units that the definitions of messages say, by their type and the beginning of a field's path.
-_UNITS = {
-    ("sensor_msgs/msg/Temperature", "temperature"): "°C",
-    ("sensor_msgs/msg/FluidPressure", "fluid_pressure"): "Pa",
-    ("sensor_msgs/msg/Illuminance", "illuminance"): "lx",
-    ("sensor_msgs/msg/Range", "range"): "m",
-    ("sensor_msgs/msg/BatteryState", "voltage"): "V",
-    ("sensor_msgs/msg/Imu", "angular_velocity"): "rad/s",
-    ("geometry_msgs/msg/Twist", "linear"): "m/s",
-    ("geometry_msgs/msg/Twist", "angular"): "rad/s",
-}
-
-
-def unit_of_field(type_name: str, field: str) -> str:
-    """Return the unit of a number in a message; empty: its definition does not say one.
-
-    :param type_name: such as ``sensor_msgs/msg/Temperature``.
-    :param field: path of the number in it.
-    """
-    return _UNITS.get((type_name, field.partition(".")[0]), "")
-
-
 def message_class(type_name: str, parameter: str) -> Any:
     """Return the class of a message type.
 

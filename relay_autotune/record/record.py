@@ -8,7 +8,7 @@ from __future__ import annotations
 import enum
 import itertools
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
@@ -324,6 +324,7 @@ class Record:
     :param continuous_command: True: the command moved along straight lines between its instants,
         as from an analogue controller; False: it was held.
     :param unthinned: what it was before it was thinned; None: it was not.
+    :param units: of the measurement, by "y", and of the command, by "u", as far as known.
     :ivar answers: answers that the record remembers, see :func:`cached_on_record`.
     :raises RecordError: if shapes differ, a value is not finite or beyond ``LARGEST``, the time
         goes backwards, or the noise is negative.
@@ -346,6 +347,7 @@ class Record:
     held_input: PiecewiseConstant | None = None
     continuous_command: bool = False
     unthinned: Unthinned | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
     answers: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import LimitCycle, cycles_of, limit_cycle, settings_of
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 from relay_autotune.result import Analysis
-from relay_autotune.text import visible
+from relay_autotune.text import is_unit, visible
 from relay_autotune.tuning.ensemble import ensemble
 from relay_autotune.verdict import NOT_JUDGED, Judgement
 
@@ -101,6 +101,7 @@ class Case:
     :param added_delay: dead time that the controller's loop adds to the process [s].
     :param judgement: what the checks found, and the verdict.
     :param present: the gains that are in the controller now; None: not known.
+    :param units: of the measurement, by "y", and of the command, by "u", as far as known.
     :param command: the command line that made the report; empty: not known.
     """
 
@@ -124,6 +125,7 @@ class Case:
     added_delay: float = 0.0
     judgement: Judgement = NOT_JUDGED
     present: Controller | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
     command: str = ""
 
     @property
@@ -179,6 +181,7 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
         models_around=_judged_on(analysis),
         added_delay=analysis.added_delay,
         judgement=analysis.judgement,
+        units=record.units,
     )
 
 
@@ -371,6 +374,7 @@ def _case(e: dict[str, Any], source: str, truth: TransferFunction | None) -> Cas
         models_around=around(None if selected is None else models[selected]),
         added_delay=number(e.get("added_delay", 0.0)),
         judgement=judgement_of_fields(e),
+        units={n: str(u) for n, u in e.get("units", {}).items() if is_unit(str(u))},
     )
 
 

@@ -32,7 +32,7 @@ from relay_autotune.report.findings import (
     warnings_of,
 )
 from relay_autotune.report.style import COLOURS, inline
-from relay_autotune.text import digits, plus_minus, visible
+from relay_autotune.text import digits, in_units, plus_minus, visible
 
 # Colours of the page in dark mode; those of the figures come from COLOURS.
 _NIGHT = (
@@ -116,6 +116,7 @@ def _environment() -> Environment:
         "known": math.isfinite,
         "plus_minus": plus_minus,
         "process_text": process_text,
+        "told_in": lambda text, units: Markup(in_units(text, units)),
         "mathml": lambda model: Markup(process_mathml(model)),
     }
     # What the page says of a case, each by the function that finds the words.

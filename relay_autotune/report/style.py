@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
+from relay_autotune.text import in_units
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -87,6 +89,17 @@ def finish(figure: Figure | SubFigure) -> None:
         for label in (axes.xaxis.label, axes.yaxis.label):
             label.set_color(INK)
             label.set_fontsize(9.5)
+
+
+def told_in(figure: Figure, units: Mapping[str, str]) -> None:
+    """Put the units of a loop into the labels of a figure.
+
+    :param figure: with all that is to be drawn.
+    :param units: of the measurement, by "y", and of the command, by "u", as far as known.
+    """
+    if units:
+        for text in figure.findobj(lambda each: hasattr(each, "set_text")):
+            text.set_text(in_units(text.get_text(), units))  # type: ignore[attr-defined]
 
 
 def legend(figure: Figure | SubFigure, *, columns: int) -> None:

@@ -165,7 +165,9 @@ def test_a_temperature_needs_no_field(tmp_path):
     np.testing.assert_array_equal(read(path, "/topic")[0].values, [20.0, 21.0, 22.0])
     np.testing.assert_array_equal(read(path, "/topic:variance")[0].values, [0.1] * 3)
     with McapFile(path) as file:
-        assert Topics(path, [file]).single_numbers() == ["/topic"]
+        topics = Topics(path, [file])
+        assert topics.single_numbers() == ["/topic"]
+        assert (topics.unit("/topic"), topics.unit("/topic:variance")) == ("°C", "")
 
 
 IDL = """================================================================================

@@ -275,6 +275,19 @@ def test_a_sketch_is_not_written_without_the_limits_of_its_command():
             exported(of_law("arduino_pid_v1"), "arduino_pid_v1", some)
 
 
+def test_a_command_in_percent_has_its_limits():
+    in_percent = Target(units={"y": "°C", "u": "%"}, command_max=80.0, present=30.0)
+    text = exported(of_law("arduino_pid_v1"), "arduino_pid_v1", in_percent)
+    found = settings_of(text)
+    assert (found["OutputMin"], found["OutputMax"], found["StartOutput"]) == (
+        "0.0",
+        "80.0",
+        "30.0",
+    )
+    assert "Its command is in %, from 0 to 80: scale it for the output." in text
+    assert "kc 2 %/°C" in text and "rested at 30 %" in text
+
+
 @pytest.mark.parametrize(
     "target", [OF_OVEN, replace(OF_OVEN, command_min=20.0, present=math.nan)], ids=str
 )

@@ -25,6 +25,7 @@ from made_bags import (
     write_pair,
     write_samples,
 )
+from report_cases import only
 
 from relay_autotune.analysis import analyse
 from relay_autotune.bag.csv_file import read_csv
@@ -35,6 +36,9 @@ from relay_autotune.cli import csv_to_bag, replay, terminal, tune
 from relay_autotune.errors import BagError, NotThereError
 from relay_autotune.exchange.export import EXPORTS
 from relay_autotune.record.record import Outcome, Record
+from relay_autotune.recordings import read_experiments
+from relay_autotune.report.case import case_of, cases_of_document
+from relay_autotune.report.page import page
 
 
 def write_bag(path, folder, *records):
@@ -272,6 +276,11 @@ def test_a_csv_and_the_bag_made_of_it_give_equal_numbers(tmp_path, capsys):
     status, from_bag, _ = run(capsys, "--json", tmp_path / "bag", *topics)
     assert status == 0
     (a,), (b,) = documents(from_csv), documents(from_bag)
+    # Float64 tells of no unit.
+    assert [e.pop("units") for d in (a, b) for e in d["experiments"]] == [
+        {"y": "m", "u": "%"},
+        {},
+    ]
     assert a["experiments"] == b["experiments"]
     model = a["experiments"][0]["models"][0]
     assert model["gain"] == pytest.approx(1.65, rel=0.02)
@@ -309,6 +318,39 @@ def test_columns_whose_names_tell_what_they_are_need_no_flags(tmp_path):
     assert "--measurement and --command name others" in note
     (log,) = read_csv(path, Selection(command="FIC101.SP"))
     assert (log.measurement.name, log.command.name) == ("FIC101.PV", "FIC101.SP")
+
+
+def test_everything_is_told_in_the_units_of_the_recording(tmp_path, capsys, monkeypatch):
+    rows = step_csv(tmp_path / "step.csv").read_text().splitlines()
+    rows[0] = "Time (s),PV [°C],OP [%],Extra"
+    path = tmp_path / "oven.csv"
+    path.write_text("\n".join(rows))
+    (record,) = read_experiments(path).experiments
+    assert record.units == {"y": "°C", "u": "%"}
+    found = analyse(record, rule="imc", alone=True)
+    monkeypatch.setattr("relay_autotune.cli.jobs.analyse", lambda *_, **__: found)
+    # Of that the names of the columns alone tell nothing.
+    foreign = re.compile(r"(?<![\w/])[yu]/[yu]|\d [yu]\b|u s/y|\[[yu]\]")
+    status, table, _ = run(capsys, path)
+    assert status == 0 and not foreign.search(table)
+    for told in (r"gain +[\d.]+ °C/%", r"kc [\d.]+ %/°C", r"i [\d.]+ %/\(°C s\)", r"\d °C s/%"):
+        assert re.search(told, table)
+    assert "%/°C" in repr(found) and "%/°C" in found._repr_html_()
+    _, out, _ = run(capsys, "--json", path)
+    (experiment,) = documents(out)[0]["experiments"]
+    assert experiment["units"] == {"y": "°C", "u": "%"}
+    _, sketch, _ = run(capsys, "--export", "yaml", path)
+    assert "# %/°C" in sketch and not foreign.search(sketch)
+    # The page is made of the document, as well as of the samples.
+    (case,) = cases_of_document(json.loads(out), "oven")
+    only(monkeypatch)
+    shown = page([case, case_of(found, "oven")])
+    sections = shown[shown.index("<main>") : shown.index("</main>")]
+    assert sections.count("IAE, load [°C s/%]") == 2 and not foreign.search(sections)
+    # What is no unit stays out.
+    path.write_text("\n".join([rows[0].replace("°C", "left side, raw"), *rows[1:]]))
+    (record,) = read_experiments(path).experiments
+    assert record.units == {"u": "%"}
 
 
 def test_names_given_for_several_apply_to_those_that_have_them(tmp_path, capsys, monkeypatch):

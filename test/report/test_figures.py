@@ -53,6 +53,13 @@ def test_a_closed_loop_with_a_law_shows_that_law_sample_by_sample() -> None:
     assert np.flatnonzero(run.measurement > 1e-9)[0] == 7
 
 
+def test_labels_are_in_the_units_of_the_recording() -> None:
+    case = replace(case_of(completed(), "tank"), units={"y": "bar", "u": "%"})
+    plate = next(each for each in PLATES if each.key == "experiment")
+    labels = [axes.get_ylabel() for axes in plate.figure(case).axes]
+    assert labels == ["measurement [bar]", "command [%]"]
+
+
 def test_thinning_keeps_every_extreme_of_a_long_signal() -> None:
     rng = np.random.default_rng(1)
     time, values = np.arange(50_000.0), rng.normal(size=50_000)
