@@ -446,7 +446,7 @@ class AfterTune:
                     else self._designed(answer, against)
                 )
             except RelayAutotuneError as error:
-                say(PROGRAM, f"no gains for {answer}: {error}")
+                say(PROGRAM, f"{answer}: {error}")
 
     def _designed(self, law: str, against: str) -> _Written:
         """Design gains for the law of a program, from the record of the tune, and show them."""
@@ -463,7 +463,7 @@ class AfterTune:
             found = analysed_as_there(record, asked_for, working.at)
         gains = found.best_gains
         if gains is None:
-            raise RelayAutotuneError(found.reason.removeprefix("no gains: "))
+            raise RelayAutotuneError(found.reason)
         told = ", ".join(f"{name} {digits(getattr(gains, name))}" for name in ("kc", "ti", "td"))
         told += f", every {period:g} s; {'; '.join(gains.warnings) or 'Ms ' + digits(gains.ms, 3)}"
         tell(f"for {law}", told)

@@ -16,6 +16,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cached_property
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.bag.field_path import first_numbers, unit_of_field
@@ -99,11 +100,11 @@ class Loop:
 
         :param result: the `Tune.Result` of a dry run.
         """
+        # A relay_node of an older version sends no reasons.
+        reasons = map(reason_from_message, result.refusals)
         return [
-            f"{check}; {self.to_type(why)}" if why.typed else check
-            for check, why in zip(
-                result.checks, map(reason_from_message, result.refusals), strict=False
-            )
+            f"{check}; {self.to_type(why)}" if why is not None and why.typed else check
+            for check, why in zip_longest(result.checks, reasons)
         ]
 
     def to_type(self, why: Reason) -> str:

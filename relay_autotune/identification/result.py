@@ -56,10 +56,6 @@ def point_of(model: TransferFunction) -> tuple[float, float]:
     return (math.nan, math.nan) if point is None else (point.gain, point.frequency)
 
 
-NOT_AT_REST = "the process was not at rest at the baseline when the test began"
-"""How the warning begins that a model carries whose record did not begin at rest."""
-
-
 @dataclass(frozen=True)
 class Validation:
     """How a model's limit cycle differs from the record's, relative to the latter.
@@ -217,6 +213,8 @@ class Identification:
     fitted: FloatArray = field(default_factory=lambda: np.empty(0))
     # How strongly commands above and below the first one act, relative to the model.
     effects: tuple[float, float] = (1.0, 1.0)
+    # True: the process was not at rest at the relay's baseline when the test began.
+    began_away: bool = False
     # Dry friction that was estimated with the model, as a command [u]; 0: none.
     friction: float = 0.0
     # Standard deviation of the measurement beside drift, past and load, which the model has to

@@ -378,6 +378,9 @@ def test_what_failed_names_the_flag_and_no_node_that_ends_with_the_command() -> 
     # Another node's reason may lack a value.
     answer.refusals[0].names = answer.refusals[0].values = []
     assert own.checklist(answer) == answer.checks
+    # One of an older version sends none.
+    answer.refusals = []
+    assert own.checklist(answer) == answer.checks
 
 
 def test_what_is_given_and_cannot_be_is_refused_before_any_question(typed: list[str]) -> None:

@@ -14,7 +14,7 @@ from analysed import completed, swing_check
 from relay_autotune.analysis import model_so_far
 from relay_autotune.errors import ParameterError
 from relay_autotune.identification.judgement.table import CHECKS, MODEL_CHECKS
-from relay_autotune.identification.result import NOT_AT_REST, Validation
+from relay_autotune.identification.result import Validation
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Result, Verdict, judge, verdict_named
 
 
@@ -77,14 +77,14 @@ def test_a_running_experiment_is_not_judged():
 def test_a_model_without_limit_cycle_is_said_in_words_and_a_start_away_from_rest_comes_first():
     check = next(check for check in MODEL_CHECKS if check.name == "limit_cycle")
 
-    def said(validation: Validation, *warnings: str) -> str:
-        found = SimpleNamespace(validation=validation, warnings=warnings, friction=0.0)
+    def said(validation: Validation, *, away: bool = False) -> str:
+        found = SimpleNamespace(validation=validation, began_away=away, friction=0.0)
         return check(SimpleNamespace(found=found, settled=True)).sentence
 
     none = Validation(reason="the measurement never reaches 6: there is no limit cycle")
     told = "the same relay on the model does not oscillate as recorded: the measurement never"
     assert said(none).startswith(told)
     assert "inf" not in said(none)
-    assert said(none, f"{NOT_AT_REST}, and so on").startswith(NOT_AT_REST)
+    assert said(none, away=True).startswith("the test did not begin at rest")
     other = "the same relay on the model oscillates with another period, 0.250 off"
     assert said(Validation(period=-0.25)) == other

@@ -24,7 +24,6 @@ from relay_autotune.identification.judgement.evidence import (
     MOST_GROWTH,
     Evidence,
 )
-from relay_autotune.identification.result import NOT_AT_REST
 from relay_autotune.text import digits
 from relay_autotune.verdict import Check, Measured, not_known
 
@@ -68,8 +67,8 @@ def _limit_cycle(evidence: Evidence) -> Measured | None:
     if validation.reason:
         away, said = math.inf, f"does not oscillate as recorded: {validation.reason}"
     first = ""
-    if any(warning.startswith(NOT_AT_REST) for warning in evidence.found.warnings):
-        first = f"{NOT_AT_REST}, so that the baseline may be wrong, and "
+    if evidence.found.began_away:
+        first = "the test did not begin at rest, so that the baseline may be wrong, and "
     return Measured(away, f"{first}the same relay on the model {said}")
 
 

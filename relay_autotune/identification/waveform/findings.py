@@ -19,7 +19,6 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import (
-    NOT_AT_REST,
     FitReport,
     Identification,
     Rival,
@@ -110,6 +109,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         draws=allowed.models,
         halves=allowed.halves,
         effects=problem.effects(state.coefficients),
+        began_away=_began_away(records, fit),
         friction=problem.dry_friction(state.coefficients),
         to_explain=scale * _spread_beside(problem, state),
     )
@@ -234,9 +234,11 @@ def _measured_noise(records: Sequence[Record]) -> float:
     return math.sqrt(sum(squares) / len(squares)) if len(squares) == len(records) else math.nan
 
 
-def _from_baseline(record: Record) -> bool:
-    """Return whether a record is of a relay test that began at its baseline."""
-    return record.settings is not None and record.input().initial == record.settings.baseline
+def _began_away(records: Sequence[Record], fit: Fit) -> bool:
+    """Return whether a process moved though a relay test began at its baseline."""
+    return (fit.problem.relaxation or fit.problem.past) and any(
+        r.settings is not None and r.input().initial == r.settings.baseline for r in records
+    )
 
 
 def _warnings(
@@ -294,10 +296,10 @@ def _warnings(
         found.append(
             "the measurement drifts, and the drift was fitted with the model; wait for rest"
         )
-    if (fit.problem.relaxation or fit.problem.past) and any(map(_from_baseline, records)):
+    if _began_away(records, fit):
         found.append(
-            f"{NOT_AT_REST}, and its way there was fitted with the model; check the baseline, or "
-            f"wait longer before a test"
+            "the process was not at rest at the baseline when the test began, and its way there "
+            "was fitted with the model; check the baseline, or wait longer before a test"
         )
     if fit.loss != "squares":
         found.append(f"the {fit.loss} loss was minimised, as asked for, in place of the squares")
