@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+BAG = str(ROOT / "bags/biased_relay")
 WITHOUT = """
 import sys
 sys.modules.update(dict.fromkeys({0!r}))
@@ -23,7 +24,7 @@ sys.exit({1}())
 @pytest.mark.parametrize(
     ("name", "words", "absent", "told"),
     [
-        ("report", [str(ROOT / "bags/biased_relay"), "-o", "tune.html"], ["jinja2"], "[report]"),
+        ("report", [BAG, "--structure", "fopdt", "-o", "tune.html"], ["jinja2"], "[report]"),
         ("csv_to_bag", [str(ROOT / "bags/heater.csv"), "bag"], ["yaml"], "[bags]"),
         ("relay_node", [], ["rclpy"], "make setup"),
         ("apply_gains", [], ["rclpy"], "make setup"),

@@ -10,6 +10,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 from analysed import completed, doubted
+from report_cases import only
 
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE, worst
 from relay_autotune.cli.jobs import status_of
@@ -39,7 +40,8 @@ def test_an_ordinary_tune_is_trusted_everywhere():
     assert verdict_of(case_of(found, "tank")).tone == "good"
 
 
-def test_a_doubt_marks_the_gains_in_table_document_page_and_message():
+def test_a_doubt_marks_the_gains_in_table_document_page_and_message(monkeypatch):
+    only(monkeypatch)
     found = doubted()
     said = "the swing is 1.50 m in the cycles, more than 1.00 m: hold it"
     assert status_of([found]) == DOUBTFUL
