@@ -66,7 +66,6 @@ def test_the_chosen_method_and_rule_come_first():
     assert found.best_gains.rule == "imc"
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("outcome", [Outcome.ABORTED, Outcome.FAILED])
 def test_an_experiment_that_did_not_complete_yields_no_gains(outcome):
     ended = replace(_record(), outcome=outcome, reason="the operator said stop")

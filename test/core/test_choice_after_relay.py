@@ -19,6 +19,8 @@ from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.record import Record
 
+pytestmark = pytest.mark.long
+
 
 def _point(model: TransferFunction) -> UltimatePoint:
     point = ultimate_point(model)
@@ -39,7 +41,6 @@ def _record(model: TransferFunction, noise_std: float, seed: int) -> Record:
     return experiment.record()
 
 
-@pytest.mark.long
 def test_a_first_swing_much_longer_than_the_cycles_does_not_turn_the_gain():
     model = TransferFunction.sopdt(2.0, (2.0, 0.99), 0.01)
     record = _record(model, 5e-4, 0)
@@ -50,7 +51,6 @@ def test_a_first_swing_much_longer_than_the_cycles_does_not_turn_the_gain():
     assert found.ultimate_gain == pytest.approx(_point(model).gain, rel=0.04)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     "seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))]
 )
@@ -63,7 +63,6 @@ def test_a_pair_faster_than_its_lag_is_no_drift(seed):
     assert not any("drift" in w for w in found.warnings)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("noise_std", "within"), [(0.0, 1e-9), (0.002, 3e-3)])
 @pytest.mark.parametrize(
     "model",
@@ -92,7 +91,6 @@ def test_an_inverse_response_is_found_that_a_fopdt_does_not_show(model, noise_st
     assert found.ultimate_gain == pytest.approx(_point(model).gain, rel=within)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("seed", [3, 15])
 def test_a_first_swing_that_a_fopdt_lacks_is_not_left_out(seed):
     model = TransferFunction(1.0, (), (1.0, 0.2, 0.04, 0.008), 0, 0.0)

@@ -27,6 +27,8 @@ from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.cycles import find_relay, infer_settings
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
+pytestmark = pytest.mark.long
+
 GAIN, TAU, DEAD_TIME = 2.0, 5.0, 2.0
 PROCESS = TransferFunction.fopdt(GAIN, TAU, DEAD_TIME)
 PERIOD = 0.1
@@ -107,7 +109,6 @@ def test_a_slow_disturbance_as_a_colour():
     assert colour.whitened(np.array([1.0, 0.0])) == pytest.approx([variance**-0.5, -0.99])
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("pole", "seed"),
     [
@@ -127,7 +128,6 @@ def test_correlated_noise_beside_a_relay_test(pole, seed):
     assert abs(found.ultimate_gain - true.gain) < 3.5 * found.ultimate_gain_std
 
 
-@pytest.mark.long
 def test_in_a_colour_structures_are_weighted_by_akaikes_criterion():
     rng = np.random.default_rng(5)
     record = relay_test(0.09 * correlated(0.9, 1400, rng), np.zeros(1400))
@@ -141,7 +141,6 @@ def test_in_a_colour_structures_are_weighted_by_akaikes_criterion():
     assert max(support(stable)[1:]) > 0.1  # a richer structure counts beside the chosen FOPDT
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.nightly)])
 def test_a_load_that_walks_at_random_beside_a_relay_test(seed):
     """A tenth of the error of least squares, which bends gain and dead time to the load."""
@@ -155,7 +154,6 @@ def test_a_load_that_walks_at_random_beside_a_relay_test(seed):
     assert error < 3.5 * found.ultimate_gain_std
 
 
-@pytest.mark.long
 def test_a_heater_that_is_switched_on_with_the_first_sample():
     """The command before is nowhere in the record, nor is the dead time before it acts."""
     time = np.arange(900.0)
@@ -171,7 +169,6 @@ def test_a_heater_that_is_switched_on_with_the_first_sample():
     assert np.all(np.isfinite(found.fitted))
 
 
-@pytest.mark.long
 def test_an_oven_that_rests_and_then_warms_has_a_positive_gain():
     """A single step beside a slow disturbance, which once passed for a drift and a zero."""
     time = np.arange(1200.0)
@@ -186,7 +183,6 @@ def test_an_oven_that_rests_and_then_warms_has_a_positive_gain():
     assert found.model.dead_time < 30.0
 
 
-@pytest.mark.long
 def test_a_step_after_a_rest_of_few_samples_is_no_drift():
     # An unknown state and command before the record explain all of it, too, but need not.
     rng = np.random.default_rng(1)
@@ -213,7 +209,6 @@ def test_a_process_that_visibly_rested_needs_no_past():
     assert not any(nuisances_of(best.problem)[1:])
 
 
-@pytest.mark.long
 def test_a_step_that_came_just_before_the_record_leaves_no_endless_dead_time():
     """Gain and dead time cannot be told apart; draws of 1e9 s took the gains for ever."""
     time = 0.02 * np.arange(170.0)
@@ -254,7 +249,6 @@ def test_heating_up_from_cold_is_no_switch_of_the_relay():
     assert record.time[relay.up[0]] > 300.0
 
 
-@pytest.mark.long
 def test_where_no_structure_fits_in_any_colour_the_noise_counts_as_white():
     """An outlier ends a walk: in colour, each dead time is longer than the record allows."""
     rng = np.random.default_rng(9)
@@ -301,7 +295,6 @@ def test_a_growing_mode_is_tried_where_a_relay_held_the_process(sign):
     assert ("unstable_fopdt" in tried) is bool(sign)
 
 
-@pytest.mark.long
 def test_an_integrator_that_is_driven_one_way_is_no_lag_of_many_records():
     rng, time = np.random.default_rng(0), 0.01 * np.arange(800)
     u = 60.0 + 20.0 * np.sin(time) + 0.15 * np.cumsum(rng.normal(0.0, 1.0, time.size))

@@ -16,6 +16,8 @@ from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome
 
+pytestmark = pytest.mark.long
+
 SECOND_ORDER = structure_named("sopdt_zero").of_fields(
     gain=0.38, time_constants=[1.3, 0.32], zeros=[-1.2], dead_time=0.09
 )
@@ -32,7 +34,6 @@ def run(model, *, sign, period, **acting):
     return tuned(model, parameters, period=period, seed=11, **acting)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "period", "noise_std"),
     [
@@ -54,7 +55,6 @@ def test_a_record_that_speaks_for_the_other_direction_yields_no_gains(model, per
     assert wrong.model.process_sign == -model.process_sign
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "period"),
     [(SECOND_ORDER, 0.05), pytest.param(SLOWER, 0.1, marks=pytest.mark.nightly)],
@@ -67,7 +67,6 @@ def test_the_right_direction_of_an_inverse_response_yields_gains(model, period):
     assert np.sign(found.best_gains.kc) == model.process_sign
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     "acting",
     [

@@ -19,6 +19,8 @@ from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record, RelaySettings
 
+pytestmark = pytest.mark.long
+
 FOPDT = Known(structure="fopdt")
 TRUTH = (1.65, 20.0, 10.0)
 
@@ -41,7 +43,6 @@ def _record(
     return run.record(noise_std=std, rng=np.random.default_rng(seed))
 
 
-@pytest.mark.long
 def test_without_noise_records_of_different_operating_points_give_the_process_exactly():
     records = (_record(at=5.0), _record(at=-80.0, bias=0.3, samples=700))
     found = identify_jointly(records, "waveform")
@@ -105,7 +106,6 @@ def test_records_of_opposite_direction_are_refused():
         identify_jointly((one, two), "waveform")
 
 
-@pytest.mark.long
 def test_a_joint_model_gets_gains():
     records = [
         replace(r, outcome=Outcome.COMPLETED) for r in (_record(), _record(bias=0.3, seed=1))

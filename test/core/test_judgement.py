@@ -34,6 +34,8 @@ from relay_autotune.process.virtual_process import Actuator, Disturbances, Virtu
 from relay_autotune.record.record import PiecewiseConstant, Record
 from relay_autotune.verdict import Result, Verdict, judge
 
+pytestmark = pytest.mark.long
+
 PROCESS = TransferFunction.fopdt(2.0, 10.0, 3.0)
 
 
@@ -103,7 +105,6 @@ def test_beside_the_right_model_noise_of_any_colour_shows_next_to_nothing(record
     assert np.max((np.abs(mean) + scatter) / np.abs(PROCESS(1j * w))[0]) < 0.1
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "passes"),
     [
@@ -151,7 +152,6 @@ def test_gains_far_slower_than_the_process_are_told(record, gains, slower, resul
     assert found.result is result
 
 
-@pytest.mark.long
 def test_a_model_that_would_have_run_away_is_refused(record, gains):
     growing = UNSTABLE_FOPDT.build((2.0, 5.0, 1.0))
     found = findings(record, growing, gains)["growth"]
@@ -172,7 +172,6 @@ def test_models_on_which_the_loop_is_unstable_are_the_risk(record, gains, bad, r
     assert (risk.value, risk.result) == (bad / 100, result)
 
 
-@pytest.mark.long
 def test_steps_and_relays_of_ordinary_processes_are_trusted(record):
     assert analyse(record).verdict is Verdict.TRUSTED
     assert completed().verdict is Verdict.TRUSTED
@@ -222,7 +221,6 @@ def in_halves(record):
     return identify(record, "waveform", Known(structure="fopdt"))
 
 
-@pytest.mark.long
 def test_each_half_of_a_record_tells_its_own_process():
     other = TransferFunction.fopdt(2.0, 10.0, 5.0)
     early, late = in_halves(joined(PROCESS, other)).halves
@@ -232,7 +230,6 @@ def test_each_half_of_a_record_tells_its_own_process():
         assert np.median(away) < 0.15
 
 
-@pytest.mark.long
 def test_a_process_that_changed_is_drawn_as_each_half_shows_it():
     found = in_halves(joined(PROCESS, TransferFunction.fopdt(2.0, 10.0, 5.0)))
     late = [m.dead_time for m in found.draws]
@@ -243,7 +240,6 @@ def test_a_process_that_changed_is_drawn_as_each_half_shows_it():
     assert not any("two halves of the record" in text for text in same.warnings)
 
 
-@pytest.mark.long
 def test_gains_that_do_not_hold_on_one_half_are_doubtful(record, gains):
     found = identified(record)
     other = TransferFunction.fopdt(20.0, 10.0, 3.0)
@@ -266,7 +262,6 @@ def test_a_half_that_works_in_the_other_direction_gives_no_gains(record, gains, 
     assert of_checks(record, found, gains)["direction"].result is result
 
 
-@pytest.mark.long
 def test_a_half_that_shows_nothing_objects_to_nothing():
     # The noise of the first half is twenty times that of the other.
     record = joined(PROCESS, PROCESS)
@@ -277,7 +272,6 @@ def test_a_half_that_shows_nothing_objects_to_nothing():
     assert findings_of["direction"].result is Result.PASSED
 
 
-@pytest.mark.long
 def test_no_draw_goes_beyond_what_the_samples_allow():
     """A zero of a hundredth of the lag, of which a first-order covariance says next to nothing."""
     process = TransferFunction.sopdt(0.8, (2.0, 0.4), 0.0)
@@ -289,7 +283,6 @@ def test_no_draw_goes_beyond_what_the_samples_allow():
         assert np.abs(model(w) / process(w) - 1.0).max() < 0.5
 
 
-@pytest.mark.long
 def test_the_draws_have_the_spread_of_the_covariance(record):
     found = in_halves(record)
     for name, of in (("dead_time", "dead_time"), ("gain", "gain")):
@@ -342,7 +335,6 @@ def fed_back(process, gain, *, steps=2000):
     return Record(time=time, measurement=y, command=u)
 
 
-@pytest.mark.long
 def test_a_controller_that_is_read_backward_gives_no_gains():
     record = fed_back(TransferFunction.fopdt(2.0, 4.0, 1.0), 1.5)
     assert read_backward(record, TransferFunction(-1.0 / 1.5)) == pytest.approx(1.0, abs=0.01)
@@ -364,7 +356,6 @@ def test_a_command_from_outside_is_not_fed_back(command):
     assert share is None or share < 0.3
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("tau", "result"), [(8.0, Result.PASSED), (0.2, Result.DOUBTFUL)])
 def test_an_answer_between_few_samples_is_not_trusted(record, gains, tau, result):
     found = fitted_as(TransferFunction.fopdt(2.0, tau, 0.1), record)
@@ -389,7 +380,6 @@ def test_gains_from_a_clipped_actuator_are_not_trusted():
     assert analyse(clipped_steps(1.5), alone=True).verdict is not Verdict.TRUSTED
 
 
-@pytest.mark.long
 def test_a_relay_whose_levels_are_clipped_on_one_side_gives_no_trusted_gains():
     process = TransferFunction.fopdt(1.0, 8.0, 3.0)
     plant = VirtualProcess(
@@ -410,7 +400,6 @@ def test_a_relay_whose_levels_are_clipped_on_one_side_gives_no_trusted_gains():
     assert clipped.result is not Result.PASSED
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("share", "result"), [(0.3, Result.PASSED), (0.7, Result.DOUBTFUL)])
 def test_a_model_of_less_than_half_of_the_record_is_doubtful(record, gains, share, result):
     found = fitted_as(PROCESS, record)

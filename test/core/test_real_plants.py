@@ -22,6 +22,8 @@ from relay_autotune.process.virtual_process import Actuator, Disturbances, Virtu
 from relay_autotune.record.cycles import cycles_of
 from relay_autotune.record.record import Outcome
 
+pytestmark = pytest.mark.long
+
 PROCESS = structure_named("fopdt").of_fields(gain=1.65, time_constants=[20.0], dead_time=10.0)
 # A slow heater: 2.5 degrees for a percent.
 HEATER = structure_named("fopdt").of_fields(gain=2.5, time_constants=[600.0], dead_time=40.0)
@@ -62,7 +64,6 @@ def check(tune, rel=0.05):
     assert gain_of(tune) == pytest.approx(ULTIMATE_GAIN, rel=rel)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("load_time", "load_size"), [(60.0, -0.4), (110.0, 0.3)])
 def test_a_load_at_the_begin_of_the_test_is_left_out(load_time, load_size):
     check(run(load_time=load_time, load_size=load_size, noise_std=0.01), rel=0.03)
@@ -95,7 +96,6 @@ def test_the_end_alone_is_judged_by_what_it_leaves_beyond_the_noise(end, left_ou
     assert (chosen is whole) is not left_out
 
 
-@pytest.mark.long
 def test_a_load_that_stops_the_oscillation_is_borne():
     tune = run(load_time=150.0, load_size=1.5, noise_std=0.01, max_cycles=20)
     assert tune.outcome is Outcome.COMPLETED, tune.reason
@@ -103,7 +103,6 @@ def test_a_load_that_stops_the_oscillation_is_borne():
     check(tune, rel=0.03)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("load_time", "load_size"), [(90.0, 0.8), (110.0, 1.5)])
 def test_a_load_that_stops_the_first_cycle_is_borne(load_time, load_size):
     tune = run(load_time=load_time, load_size=load_size, noise_std=0.01, max_cycles=20)

@@ -21,6 +21,8 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record, RelaySettings
 
+pytestmark = pytest.mark.long
+
 
 def record_of(model, hysteresis=0.0, noise=0.0, seed=3, cycles=6, samples=1200, **relay):
     settings = RelaySettings(5.0, 40.0, 1.0, hysteresis=hysteresis, **relay)
@@ -35,7 +37,6 @@ def thyagarajan(record, **known):
     return identify(record, "thyagarajan", Known(**known))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("hysteresis", [0.0, 0.1])
 @pytest.mark.parametrize("gain", [1.65, -1.65])
 def test_a_fopdt_record(gain, hysteresis):
@@ -85,7 +86,6 @@ def test_a_slowly_growing_record_is_taken_for_two_lags():
     assert known.ultimate_gain == pytest.approx(ultimate_point(model).gain, rel=0.03)
 
 
-@pytest.mark.long
 def test_a_record_of_high_order():
     model = TransferFunction.lag_n(1.0, 6.0, 8, 0.6)
     record = record_of(model, 0.05)
@@ -111,7 +111,6 @@ def test_noise_is_averaged_and_reported(noise):
     assert math.sqrt(np.mean(np.square(ultimate))) < 0.3 * noise
 
 
-@pytest.mark.long
 def test_a_sampled_relay_that_sees_the_noise():
     model = TransferFunction.fopdt(1.0, 2.0, 1.0)
     noise = 0.03 * np.random.default_rng(5).standard_normal(4000)
@@ -138,7 +137,6 @@ def test_a_peak_at_a_quarter_of_the_period_tells_gain_over_time_constant_only():
     assert found.ultimate_gain == pytest.approx(ultimate_point(model).gain, rel=0.05)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("structure", "order", "orders"), [("fopdt", 0, 1), ("lag_n", 2, 2), ("lag_n", 0, 5)]
 )
@@ -149,7 +147,6 @@ def test_the_structure_may_be_given(structure, order, orders):
     assert found.model.order == orders
 
 
-@pytest.mark.long
 def test_what_it_cannot_use_is_refused():
     record = record_of(TransferFunction.fopdt(1.0, 2.0, 1.0), 0.1)
     with pytest.raises(IdentificationError, match="no structure 'ipdt'"):
@@ -185,7 +182,6 @@ def test_unequal_halves_are_remarked():
     assert any("half periods differ" in w for w in thyagarajan(run.record()).warnings)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("method", ["thyagarajan", "luyben_step"])
 def test_nonsense_is_refused_or_identified_but_never_an_accident(method):
     rng = np.random.default_rng(0)

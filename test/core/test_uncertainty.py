@@ -26,6 +26,8 @@ from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
+pytestmark = pytest.mark.long
+
 GIVEN = Known(structure="fopdt")
 
 
@@ -39,7 +41,6 @@ def _record(
     return run.record(noise_std=std, rng=np.random.default_rng(seed))
 
 
-@pytest.mark.long
 def test_draws_are_as_likely_as_the_samples_make_them():
     """One lag of which a short record shows hardly more than the slope, by brute force."""
     rng = np.random.default_rng(3)
@@ -99,7 +100,6 @@ def test_a_determined_model_needs_no_combinations():
     assert found.advice == ()
 
 
-@pytest.mark.long
 def test_rivals_have_support():
     model = TransferFunction.lag_n(1.0, 6.0, 8, 0.6)
     relay = RelaySettings(0.0, 0.0, 1.0)
@@ -128,7 +128,6 @@ def test_a_robust_loss_withstands_outliers_that_squares_do_not(loss):
     assert any(loss in w for w in robust.warnings)
 
 
-@pytest.mark.long
 def test_a_robust_loss_loses_five_percent_on_normal_noise():
     record = _record((1.65, 20.0, 10.0), 0.1)
     plain = identify(record, "waveform", GIVEN)

@@ -32,6 +32,8 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
+pytestmark = pytest.mark.long
+
 FOPDT = Known(structure="fopdt")
 
 
@@ -42,7 +44,6 @@ def _run(gain: float, tau: float, dead: float, bias: float = 0.0, samples: int =
     return simulate_relay(model, relay, cycles=5, time=np.linspace(0.0, end, samples))
 
 
-@pytest.mark.long
 @settings(deadline=None, max_examples=8)
 @given(
     gain=st.floats(0.1, 10.0) | st.floats(-10.0, -0.1),
@@ -123,7 +124,6 @@ def test_the_intervals_cover_the_truth():
     assert min(inside) > 0.873
 
 
-@pytest.mark.long
 def test_a_relay_that_sees_the_noise_at_its_samples():
     model = TransferFunction.fopdt(1.65, 20.0, 10.0)
     relay = RelaySettings(5.0, 40.0, 1.0, 0.3, 0.3)
@@ -144,14 +144,12 @@ def _staircase(seed: int = 0) -> tuple[np.ndarray, np.ndarray, Record]:
     return time, y, Record(time, y, u(time), held_input=u)
 
 
-@pytest.mark.long
 def test_any_held_input_and_irregular_samples_will_do():
     _, _, record = _staircase()
     found = identify_waveform(record)
     assert found.values == pytest.approx([1.2, 6.0, 2.345], rel=1e-9)
 
 
-@pytest.mark.long
 def test_a_step_test():
     time = np.linspace(0.0, 60.0, 300)
     u = PiecewiseConstant(np.array([5.0]), np.array([2.0]), 0.0)
@@ -160,7 +158,6 @@ def test_a_step_test():
     assert found.values == pytest.approx([1.2, 6.0, 2.345], rel=1e-9)
 
 
-@pytest.mark.long
 def test_a_drift_is_estimated_and_said():
     time, y, record = _staircase()
     rng = np.random.default_rng(1)
@@ -170,7 +167,6 @@ def test_a_drift_is_estimated_and_said():
     assert any("drift" in w for w in found.warnings)
 
 
-@pytest.mark.long
 def test_a_start_away_from_rest_is_estimated():
     time, y, record = _staircase()
     moving = y + 3.0 * np.exp(-(time - time[0]) / 6.0)
@@ -178,7 +174,6 @@ def test_a_start_away_from_rest_is_estimated():
     assert found.values == pytest.approx([1.2, 6.0, 2.345], rel=1e-6)
 
 
-@pytest.mark.long
 # Two phases of the oscillation, of which one shows what the other does.
 @pytest.mark.parametrize("start", [pytest.param(600, marks=pytest.mark.nightly), 900])
 def test_a_record_cut_out_of_an_oscillation(start):
@@ -195,7 +190,6 @@ def test_a_record_cut_out_of_an_oscillation(start):
     assert found.values == pytest.approx([1.65, 20.0, 10.0], rel=1e-6)
 
 
-@pytest.mark.long
 def test_a_second_input_shows_in_the_residual_and_is_said():
     time, y, record = _staircase()
     other = PiecewiseConstant(np.array([40.0, 130.0]), np.array([1.0, 0.0]), 0.0)
@@ -214,7 +208,6 @@ def test_a_gain_that_the_data_do_not_tell_is_named():
     assert abs(found.ultimate_gain_std / found.ultimate_gain) < 0.05
 
 
-@pytest.mark.long
 def test_whether_a_slow_process_integrates_is_said_to_be_open():
     found = identify_waveform(_noisy(_run(1.0, 1.0, 0.02), 0.2, 3))
     assert found.structure == "ipdt"
@@ -224,7 +217,6 @@ def test_whether_a_slow_process_integrates_is_said_to_be_open():
     )
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("measurement", "command", "said"),
     [
@@ -240,7 +232,6 @@ def test_data_that_tell_nothing_are_refused_with_the_reason(measurement, command
         identify_waveform(Record(time, measurement, command))
 
 
-@pytest.mark.long
 @pytest.mark.by_day(2)
 @pytest.mark.parametrize("seed", [8, 0, 2, 11])
 def test_noise_shows_no_response_whichever_fits_to_it_run_off(seed):
@@ -257,7 +248,6 @@ def test_an_unknown_structure_is_refused():
         identify_waveform(_staircase()[2], Known(structure="ladder"))
 
 
-@pytest.mark.long
 @settings(deadline=None, max_examples=5)
 @given(
     seed=st.integers(0, 10_000),
@@ -305,7 +295,6 @@ def test_spikes_of_the_sensor_are_left_out_and_told():
     assert int(np.sum(np.isnan(found.fitted))) == 9
 
 
-@pytest.mark.long
 def test_clean_records_have_no_outliers():
     for seed in range(8):
         found = identify_waveform(_noisy(_run(1.65, 20.0, 10.0), 0.1, seed), FOPDT)
@@ -323,7 +312,6 @@ def test_a_step_of_a_coarse_sensor_is_no_spike():
     assert not any("spikes" in w for w in found.warnings)
 
 
-@pytest.mark.long
 def test_a_record_that_begins_in_a_movement_and_ends_as_its_command_does():
     # What is left once the movement is over holds no change of the command that a sample follows,
     # so that the model is that of the whole record.
@@ -354,7 +342,6 @@ def test_neither_noise_nor_drift_counts_as_a_first_response(dead_time, tau, drif
     assert latest_dead_time(time, y, step, 1) >= 2.0 * dead_time
 
 
-@pytest.mark.long
 def test_a_dead_time_that_hides_the_first_response_is_no_explanation():
     """Steps of one length, unequal in their effect, look like each other one step later."""
     time = np.arange(0.0, 4900.0, 4.0)
@@ -404,7 +391,6 @@ def test_a_fit_ends_where_lags_far_below_the_period_explain_nothing_more():
             assert found.cost <= evaluate(problem, start).cost
 
 
-@pytest.mark.long
 def test_a_jump_in_the_last_samples_is_left_out():
     time = np.arange(0.0, 300.0, 0.5)
     command = np.array([0.0, 1.0, -1.0, 1.0, 0.0, 1.0])[(time // 50.0).astype(int)]
