@@ -33,6 +33,7 @@ from relay_autotune.experiment.relay_law import (
     ample_swing,
     clear_swing,
 )
+from relay_autotune.experiment.settling import rest_state
 from relay_autotune.reasons import Code, Reason, Value
 from relay_autotune.record.cycles import MIN_CYCLES, cycle_from_samples, next_cycle
 from relay_autotune.record.record import Cycle
@@ -84,6 +85,10 @@ _CLEARLY = 5.0
 
 # A measurement that did not move for this many stays of the relay does not follow it.
 _STAYS = 2
+
+# Whether it rests within the band is looked at after this many times the time to respond: by then
+# it has moved for as long as that, if it moves at all.
+_RESTS_AFTER = 2.0
 
 # Least difference of the periods of two cycles that is told, as a fraction.
 _DIFFER = 0.001
@@ -215,6 +220,8 @@ class _Course:
         """Switches that are delayed: when, which level, and whether a cycle begins."""
         self.switched_at: deque[int] = deque(maxlen=_STAYS + 1)
         """Samples at which it switched last."""
+        self.look_after = _RESTS_AFTER * facts.response_time
+        """Length of the present stay at which it is looked whether the measurement rests [s]."""
         self.switches_before = switches
         self.began = t
         self.fast = _FastWatch(switches)
@@ -288,6 +295,9 @@ class Switching:
         if relay.update(t, y):
             if end := self._switched(t):
                 return end
+        elif self._rests_in_band(t, y):
+            self._setup.levels.grow()
+            self._begin()
         elif t - max(relay.since, self._load.waits_from) > self._limit:
             if end := self._on_timeout(t, y):
                 return end
@@ -358,6 +368,7 @@ class Switching:
         # Only a stay without a shift of the levels counts: else each shift would lengthen the
         # limit of the next stay.
         was_shifted, self._load.shifts = self._load.shifts > 0, 0
+        course.look_after = _RESTS_AFTER * self.facts.response_time
         course.answers = course.stays.add(
             t,
             relay.last_stay,
@@ -416,6 +427,22 @@ class Switching:
             return self._course.runaway.add(t, distance)
         self._away = self._away + 1 if abs(distance) > self._furthest else 0
         return self._away >= _RUNAWAY_SAMPLES
+
+    def _rests_in_band(self, t: float, y: float) -> bool:
+        """Return True if a first, small amplitude has brought the measurement to rest in the band.
+
+        It will not leave that, and the time to respond, by which a stay is limited, may hold the
+        wait for a level that the process has answered at all.
+        """
+        levels, course = self._setup.levels, self._course
+        stay = t - course.relay.since
+        if stay < course.look_after or not (levels.from_small and levels.can_grow):
+            return False
+        course.look_after = _RESTS_AFTER * stay
+        time, measurement = self._since(course.relay.since + 0.5 * stay)
+        if len(time) < TELL or abs(y - self.facts.setpoint) >= self.facts.hysteresis:
+            return False
+        return self._has_moved() and rest_state(time - time[0], measurement, len(time)).is_steady
 
     def _on_timeout(self, t: float, y: float) -> Ended | None:
         """Fail, unless the amplitude can grow or a doubtful sign can be reversed."""

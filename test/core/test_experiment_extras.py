@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -144,6 +145,20 @@ def test_both_levels_clipped_alike_within_the_limits_are_not_trusted(share, std)
             break
     if tune.outcome is Outcome.COMPLETED:
         assert analyse(tune.record(), alone=True).verdict is not Verdict.TRUSTED
+
+
+def test_a_first_amplitude_that_cannot_leave_the_band_is_made_larger_soon():
+    """The loop still moves while it settles, so that its noise is taken for too large."""
+    given = ExperimentParameters(amplitude=0.5, settle_time=0.1, process_gain_sign=1)
+    tune = RelayExperiment(given, 0.0, from_small=True)
+    before = [0.15, -0.15, 0.15, -0.15, 0.15]
+    rest = gaussian(0.001)
+    noise = itertools.chain(before, (rest() for _ in itertools.count()))
+    # A quarter of the amplitude moves it by 0.25, less than the band.
+    run(tune, FopdtPlant(2.0, 0.1, 0.05), 0.025, noise=lambda: next(noise))
+    assert tune.outcome is Outcome.COMPLETED and tune.settings.hysteresis > 0.25
+    # Until a level is answered it waits 5 s; ten times that was waited for at each level then.
+    assert tune.elapsed < 60.0
 
 
 def test_a_kick_that_noise_seemed_to_answer_is_made_larger():
