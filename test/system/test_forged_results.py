@@ -202,7 +202,7 @@ def test_forged_records_are_refused_and_the_next_one_is_identified(rig: Rig) -> 
 
 def begin_slow(rig: Rig, flag: Path) -> Any:
     """Start an identifier_node whose fits last until a file exists, and start a fit."""
-    identifier = rig.start_python("identifier", SLOW.format(flag=str(flag)))
+    identifier = rig.start_python("identifier", SLOW.format(flag=str(flag)), structure="fopdt")
     experiments = rig.node.create_publisher(RelayExperiment, "relay_experiment", LATCHED)
     rig.until(experiments.get_subscription_count, "the identifier")
     experiments.publish(experiment_of(PROCESS, "first"))
