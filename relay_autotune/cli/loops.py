@@ -277,6 +277,8 @@ class TopicLoop(Loop):
             **self.answers.parameters(),
             "command_field": self._command_field,
             "amplitude": options.amplitude,
+            # Without an identifier_node it would wait for nothing.
+            **({"model_timeout": 0.0} if options.record_only else {}),
         }
         if others := options.command_message:
             # The value of a parameter is YAML itself, so that this text needs quotes.

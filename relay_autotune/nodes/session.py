@@ -671,7 +671,9 @@ class Recordings:
             self.close(experiment_id, "with model and gains")
             return
 
-        silent = f"identifier_node did not send them within {timeout:g} s"
+        silent = "a recording alone was asked for"
+        if timeout > 0.0:
+            silent = f"identifier_node did not send them within {timeout:g} s"
         late = partial(self.wait_no_longer, experiment_id, silent)
         recording.waits_since = time.monotonic()
         recording.patience = LONGEST * timeout

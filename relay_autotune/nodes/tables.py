@@ -77,7 +77,7 @@ NODE_PARAMETERS = (
     ),
     Quantity("model_timeout", 10.0, "s", 0.0).means(
         "Longest wait of the recording for model and gains after a tune, counted from the last "
-        "sign of life of identifier_node."
+        "sign of life of identifier_node; 0: a recording alone is wanted."
     ),
     Quantity("record_directory", "~/.ros/relay_autotune").means(
         "Folder in which each experiment gets a folder of its own."

@@ -245,6 +245,13 @@ def test_flags_become_limits_levels_topics_and_types_without_a_question() -> Non
     assert set(TopicLoop(Looker(), given).arguments()) == {"relay_node", "identifier_node"}
 
 
+def test_a_recording_alone_waits_for_no_model() -> None:
+    words = ("--within", "30", "50", "--at", "2", "--command-within", "0", "5", "--record-only")
+    loop = TopicLoop(Looker(), options(*words))
+    assert set(loop.arguments()) == {"relay_node"}
+    assert "model_timeout:=0.0" in loop.arguments()["relay_node"]
+
+
 def test_the_law_of_another_program_is_designed_for() -> None:
     given = options("--within", "30", "50", "--at", "2", "--command-within", "0", "5")
     given.law, given.sample_period = "simple_pid", 0.1

@@ -83,6 +83,13 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
         assert ("the model was refused" in closed[0]) is not complete
         recordings.close_all("", 10.0)
         assert recordings.problem() == ""
+    recordings.begin("alone", str(tmp_path))
+    recordings.close_with_results("alone", 0.0, closed.append)
+    for _ in range(PATIENCE):
+        if len(closed) > 1:
+            break
+        executor.spin_once(timeout_sec=0.02)
+    assert closed[1].endswith("no pi_gains: a recording alone was asked for")
     executor.shutdown()
     told = capfd.readouterr().err
     assert "[INFO]" in told and "whole is closed with model and gains" in told
