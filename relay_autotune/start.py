@@ -18,6 +18,7 @@ import signal
 import sys
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
 
 
 def start(module: str, told_for: tuple[str, ...] = ()) -> int:
@@ -34,8 +35,12 @@ def start(module: str, told_for: tuple[str, ...] = ()) -> int:
     os.close(number)
     sys.stdout = sys.stdout or os.fdopen(1, "w", closefd=False)
     sys.stderr = sys.stderr or os.fdopen(2, "w", closefd=False)
+    name = module.rpartition(".")[2]
     if set(told_for) & set(sys.argv):
-        name = module.rpartition(".")[2]
+        if find_spec("rclpy") is None:
+            # Before it seems that something is looked at.
+            sys.stderr.write(f"{name}: {_lacking(ModuleNotFoundError(name='rclpy'))}\n")
+            return 1
         sys.stderr.write(f"{name} is loading; nothing is commanded yet\n")
         sys.stderr.flush()
     # A process that was started with SIGINT ignored, as by nohup, keeps ignoring it.
@@ -48,7 +53,7 @@ def start(module: str, told_for: tuple[str, ...] = ()) -> int:
         status: int = import_module(module).main()
     except ModuleNotFoundError as error:
         # With pip alone there is no ROS; without its extras, neither what draws nor what records.
-        sys.stderr.write(f"{module.rpartition('.')[2]}: {_lacking(error)}\n")
+        sys.stderr.write(f"{name}: {_lacking(error)}\n")
         return 1
     return status
 
@@ -63,7 +68,7 @@ def _lacking(error: ModuleNotFoundError) -> str:
     if name in ("", "relay_autotune"):
         raise error
     if extra:
-        return f"it needs the Python package {name}: pip install 'relay_autotune[{extra}]'"
+        return f"it needs the Python package {name}: pip install '.[{extra}]' in the repository"
     return f"it needs ROS 2 Jazzy with {name}: `make setup` and `. ./env.sh` in the repository"
 
 

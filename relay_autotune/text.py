@@ -22,6 +22,9 @@ from relay_autotune.errors import visible as visible
 # Half a unit of the fourth digit of 9999, the finest of four digits.
 _FINEST = 5e-5
 
+# Below it numbers have no exponent, and a share below this is shown as none.
+_PLAIN, _UNSEEN = 1e6, 5e-4
+
 # Interval at which users are told what is waited for [s]: below a second on a busy machine, too.
 TOLD_EVERY = 0.8
 # The same in a log, which nobody watches line by line [s].
@@ -36,7 +39,17 @@ def digits(value: float, count: int = 4) -> str:
     """
     if not math.isfinite(value):
         return "-"
-    return f"{value:#.{count}g}".rstrip(".") if value else "0"
+    text = f"{value:#.{count}g}".rstrip(".") if value else "0"
+    # 203 with two digits is 200, which is easier to read than 2.0e+02.
+    return f"{float(text):.0f}" if "e+" in text and abs(value) < _PLAIN else text
+
+
+def percent(share: float) -> str:
+    """Return a share in percent, with two digits; 0 where it is less than it takes to see it.
+
+    :param share: the share.
+    """
+    return digits(100.0 * share, 2) if not abs(share) < _UNSEEN else "0"
 
 
 def duration(seconds: float) -> str:

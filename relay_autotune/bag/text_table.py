@@ -289,7 +289,19 @@ class TextTable:
         if date is None:
             times.numbers.append(self._number(line, at, cell)[0])
         else:
+            if not times.dates and date[1]:
+                self._tell_order(cell)
             (times.dates if date[1] else times.clock).append(date[0])
+
+    def _tell_order(self, cell: str) -> None:
+        """Say how a date is read that could be read in two ways."""
+        found = _DATE.fullmatch(cell)
+        first, mark, second = found.groups()[:3] if found else ("", "", "")
+        if mark == "/" and first != second and max(int(first), int(second)) <= 12:
+            self.notes.append(
+                f"{cell!r} is taken with the month first, as in 12/31/2026: month {int(first)}, "
+                f"day {int(second)}"
+            )
 
     def _number(self, line: int, at: int, cell: str) -> tuple[float, str]:
         """Return a number, NaN of an empty cell, and the unit behind it."""

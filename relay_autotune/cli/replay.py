@@ -39,7 +39,7 @@ from relay_autotune.cli.report import (
     write_report,
 )
 from relay_autotune.cli.table import heading
-from relay_autotune.cli.terminal import ProgressLine, Stages, width, write
+from relay_autotune.cli.terminal import ProgressLine, Stages, require_new, width, write
 from relay_autotune.errors import SelectionError
 from relay_autotune.result import Analysis
 
@@ -134,6 +134,8 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if options.export:
         # With --export, --output is the file of the gains.
         file, options.output = options.output, None
+        if file:
+            require_new(file)
     jobs = _jobs(options)
     for flag, wanted in (("--report", options.report), ("--web", options.web)):
         if wanted and (options.output or options.scheduler or options.jobs > 1):

@@ -25,7 +25,7 @@ from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Outcome, Record
-from relay_autotune.text import date_text, digits, in_units, plus_minus
+from relay_autotune.text import date_text, digits, in_units, percent, plus_minus
 from relay_autotune.verdict import Judgement, Result, Verdict
 
 if TYPE_CHECKING:
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.result import Analysis
 
+# Chances below this are not told apart.
+_SURE = 1e-4
 # Rivals beyond these are told in the JSON document alone.
 _RIVALS = 3
 
@@ -291,7 +293,7 @@ def _identification(found: Identification) -> list[_Entry]:
     if found.validation is not None:
         lines.append(("limit cycle", _validation(found.validation)))
     for i, rival in enumerate(found.rivals[:_RIVALS]):
-        share = f"{100.0 * rival.support:.2g} % of the support"
+        share = f"{percent(rival.support)} % of the support"
         note = f"{rival.model.structure}, {share}"
         lines += _process("rivals" if i == 0 else "", rival.model, note)
     for warning in found.warnings:
@@ -320,7 +322,7 @@ def _others(analysis: Analysis) -> list[_Entry]:
     for i, m in enumerate(others):
         note = f"{m.structure}, {m.method}"
         if m.validation is not None and not m.validation.reason:
-            note += f", limit cycle {100.0 * m.validation.worst:.2g} % off"
+            note += f", limit cycle {digits(100.0 * m.validation.worst, 2)} % off"
         lines += _process("also" if i == 0 else "", m.model, note)
     return lines
 
@@ -337,7 +339,8 @@ def _fit(found: Identification) -> str:
     if math.isfinite(fit.prediction):
         parts.append(f"prediction {digits(fit.prediction, 3)} y rms")
     if math.isfinite(fit.whiteness_p):
-        parts.append(f"whiteness p = {digits(fit.whiteness_p, 2)}")
+        least = fit.whiteness_p < _SURE
+        parts.append(f"whiteness p {'< 0.0001' if least else '= ' + digits(fit.whiteness_p, 2)}")
     if math.isfinite(fit.noise_to_signal):
         power, mean = digits(fit.noise_to_signal_power, 2), digits(fit.noise_to_signal, 2)
         parts.append(f"noise to signal N1 = {power}, N2 = {mean}")
@@ -348,10 +351,14 @@ def _validation(validation: Validation) -> str:
     if validation.reason:
         return f"none of the model: {validation.reason}"
     parts = [
-        f"{name} {100.0 * getattr(validation, field):+.2g} %"
-        for name, field in (("period", "period"), ("peaks", "peak_max"), ("and", "peak_min"))
+        f"{name} {'+' * (value > 0.0)}{digits(100.0 * value, 2)} %"
+        for name, value in (
+            ("period", validation.period),
+            ("peaks", validation.peak_max),
+            ("and", validation.peak_min),
+        )
     ]
-    shape = f"shape {100.0 * validation.shape:.2g} %"
+    shape = f"shape {digits(100.0 * validation.shape, 2)} %"
     return f"of the model: {parts[0]}, {parts[1]} {parts[2]}, {shape} off the record's"
 
 
@@ -399,7 +406,9 @@ def _gains(gains: Gains, verdict: Verdict) -> list[_Entry]:
     # Gains of a message come without it.
     bare: Performance | None = getattr(gains, "bare", None)
     if bare is not None:
-        lines.append(("", f"by p, i and d alone: {_step(bare)}   Ms {digits(bare.ms, 3)}"))
+        lines.append(
+            ("", f"without filter tf and weight b: {_step(bare)}   Ms {digits(bare.ms, 3)}")
+        )
     if gains.reason:
         lines.append(("  because", gains.reason))
     for warning in gains.warnings:
@@ -409,8 +418,7 @@ def _gains(gains: Gains, verdict: Verdict) -> list[_Entry]:
 
 def _step(does: Performance) -> str:
     return (
-        f"overshoot {digits(100.0 * does.overshoot, 3)} %   "
-        f"settled after {digits(does.settling_time, 3)} s"
+        f"overshoot {percent(does.overshoot)} %   settled after {digits(does.settling_time, 3)} s"
     )
 
 

@@ -553,10 +553,10 @@ def process_text(model: TransferFunction) -> str:
 
     :param model: the process.
     """
-    above = [digits(model.gain), *map(_plain, _polynomials(model.zeros))]
+    above = [digits(model.gain), *map(_plain, _polynomials(model.zeros, model))]
     if model.dead_time:
         above.append(f"e^(-{digits(model.dead_time)} s)")
-    below = [_plain(p) for p in _polynomials(model.time_constants)]
+    below = [_plain(p) for p in _polynomials(model.time_constants, model)]
     if model.integrators:
         below.insert(0, "s" if model.integrators == 1 else f"s^{model.integrators}")
     if not below:
@@ -569,8 +569,8 @@ def process_latex(model: TransferFunction) -> str:
 
     :param model: the process.
     """
-    above = _factors(model.zeros, _latex_factor)
-    below = _factors(model.time_constants, _latex_factor)
+    above = _factors(model.zeros, model, _latex_factor)
+    below = _factors(model.time_constants, model, _latex_factor)
     if model.integrators > 0:
         below.insert(0, "s" if model.integrators == 1 else f"s^{{{model.integrators}}}")
     if model.integrators < 0:
@@ -587,8 +587,8 @@ def process_mathml(model: TransferFunction) -> str:
 
     :param model: the process.
     """
-    above = _factors(model.zeros, _mathml_factor)
-    below = _factors(model.time_constants, _mathml_factor)
+    above = _factors(model.zeros, model, _mathml_factor)
+    below = _factors(model.time_constants, model, _mathml_factor)
     if model.integrators:
         power = _mathml_power("<mi>s</mi>", abs(model.integrators))
         (below if model.integrators > 0 else above).insert(0, power)
@@ -601,13 +601,20 @@ def process_mathml(model: TransferFunction) -> str:
     return f'<math display="block"><mrow>{top}</mrow></math>'
 
 
-def _polynomials(constants: Iterable[complex]) -> list[_Polynomial]:
+# A lag of this share of the slowest one changes nothing that could be seen.
+_NO_LAG = 1e-9
+
+
+def _polynomials(constants: Iterable[complex], model: TransferFunction) -> list[_Polynomial]:
     """Return a factor for each real constant and for each conjugate pair.
 
     A pair is (1 + z s)(1 + z* s) = 1 + 2 Re(z) s + |z|^2 s^2.
     """
     found: list[_Polynomial] = []
+    slowest = max(map(abs, (*model.time_constants, *model.zeros, model.dead_time)))
     for value in constants:
+        if abs(value) < _NO_LAG * slowest:
+            continue
         if value.imag > 0.0:
             found.append((1.0, 2.0 * value.real, abs(value) ** 2))
         elif value.imag == 0.0:
@@ -622,9 +629,13 @@ def _plain(polynomial: _Polynomial) -> str:
     return f"(1 + {digits(polynomial[1])} s + {digits(polynomial[2])} s^2)"
 
 
-def _factors(constants: Iterable[complex], draw: Callable[[_Polynomial, int], str]) -> list[str]:
+def _factors(
+    constants: Iterable[complex],
+    model: TransferFunction,
+    draw: Callable[[_Polynomial, int], str],
+) -> list[str]:
     """Return the factors, equal ones as a power."""
-    counted = Counter(_polynomials(constants))
+    counted = Counter(_polynomials(constants, model))
     return [draw(polynomial, power) for polynomial, power in counted.items()]
 
 

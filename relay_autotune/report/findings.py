@@ -13,7 +13,7 @@ from relay_autotune.loop.analysis import difference, performance_on
 from relay_autotune.loop.gains import Controller, Performance
 from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import Case, in_loop
-from relay_autotune.text import date_text, digits
+from relay_autotune.text import date_text, digits, percent
 from relay_autotune.verdict import Finding, Result, Verdict
 
 Tone = Literal["good", "warn", "bad"]
@@ -137,12 +137,12 @@ def steps_of(case: Case) -> tuple[str, ...]:
     watch = "Make a small step of the set-point"
     if math.isfinite(gains.overshoot) and math.isfinite(gains.settling_time):
         watch += (
-            f": the measurement should overshoot by about {digits(100.0 * gains.overshoot, 2)} % "
+            f": the measurement should overshoot by about {percent(gains.overshoot)} % "
             f"and settle within {digits(gains.settling_time, 2)} s"
         )
         if gains.bare is not None:
             watch += (
-                f" (p, i and d alone: {digits(100.0 * gains.bare.overshoot, 2)} % and "
+                f" (without filter tf and weight b: {percent(gains.bare.overshoot)} % and "
                 f"{digits(gains.bare.settling_time, 2)} s)"
             )
     steps = (

@@ -32,7 +32,7 @@ from relay_autotune.report.findings import (
     warnings_of,
 )
 from relay_autotune.report.style import COLOURS, inline
-from relay_autotune.text import digits, in_units, plus_minus, visible
+from relay_autotune.text import digits, in_units, percent, plus_minus, visible
 
 # Colours of the page in dark mode; those of the figures come from COLOURS.
 _NIGHT = (
@@ -112,7 +112,7 @@ def _environment() -> Environment:
         "digits": digits,
         "degrees": math.degrees,
         "signed": lambda value: f"{value:+.2f}",
-        "percent": lambda share: digits(100.0 * share, 2) if share * 100.0 >= 0.05 else "0",
+        "percent": percent,
         "known": math.isfinite,
         "plus_minus": plus_minus,
         "process_text": process_text,

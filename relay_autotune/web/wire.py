@@ -31,7 +31,7 @@ from relay_autotune.report.findings import (
     warnings_of,
 )
 from relay_autotune.report.style import in_steps, thinned
-from relay_autotune.text import digits, visible
+from relay_autotune.text import digits, percent, visible
 from relay_autotune.tuning.task import DesignOptions
 from relay_autotune.verdict import Verdict
 from relay_autotune.web.shape import CALM, FAST, STEP, DesignRequest, DesignResult, PageModel
@@ -234,12 +234,12 @@ def _effects(shaped: DesignResult) -> list[list[str]]:
         ["phase margin", f"{digits(math.degrees(gains.phase_margin), 3)}°", ""],
         ["delay margin", f"{digits(gains.delay_margin, 3)} s", "dead time that may be added"],
         ["IAE, load", f"{digits(gains.iae_load, 3)} y s/u", "after a unit step of the load"],
-        ["overshoot", f"{digits(100.0 * gains.overshoot, 2)} %", "after a step of the set-point"],
+        ["overshoot", f"{percent(gains.overshoot)} %", "after a step of the set-point"],
         ["settles in", f"{digits(gains.settling_time, 3)} s", "to within 2 %"],
     ]
     if gains.bare is not None:
-        alone = f"{digits(100.0 * gains.bare.overshoot, 2)} %"
-        rows.insert(-1, ["", alone, "by p, i and d alone, without tf and b"])
+        alone = f"{percent(gains.bare.overshoot)} %"
+        rows.insert(-1, ["", alone, "where the controller has neither tf nor b"])
     noise = gains.noise_gain * shaped.options.noise_std
     if math.isfinite(noise):
         rows.append(["noise", f"{digits(noise, 2)} u", "standard deviation in the command"])

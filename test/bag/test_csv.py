@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from relay_autotune.bag.csv_file import read_csv
 from relay_autotune.bag.signals import Selection
 from relay_autotune.errors import BagError, SelectionError
 from relay_autotune.recordings import read_experiments
@@ -55,6 +56,14 @@ def test_more_columns_are_named(tmp_path):
         read_experiments(path, Selection("y", "y"))
     with pytest.raises(BagError, match=r"line 2: 'note' is 'ok'; expected a number"):
         read_experiments(path, Selection("note", "u", "t"))
+
+
+@pytest.mark.parametrize(("day", "told"), [("04/05", True), ("21/05", False), ("05/05", False)])
+def test_a_date_that_could_be_two_is_told(tmp_path, day, told):
+    rows = "".join(f"{day}/2026 06:59:{k:02},{k % 5},{k // 3 % 2}\n" for k in range(12))
+    (log,) = read_csv(write(tmp_path / "a.csv", f"time,y,u\n{rows}"), Selection())
+    said = [note for note in log.notes if "with the month first" in note]
+    assert [note.endswith(": month 4, day 5") for note in said] == [True] * told
 
 
 def test_dates_in_seconds_become_the_start(tmp_path):

@@ -402,6 +402,9 @@ def test_replay_writes_the_gains_for_the_cycle_that_the_recording_shows(tmp_path
     (cost,) = re.findall("// (iec_61131_3_pid does worse .*)", text)
     assert re.search(r"[\d.]+ times the noise in the command.*; it has no filter to set", cost)
     assert f"bags/step_test: {cost}" in shown.err
+    # At once, before what takes seconds.
+    assert replay.main([*asked[:-1], "no_such_bag"]) == 2
+    assert "exists already, not overwriting it" in capsys.readouterr().err
 
 
 def test_gains_for_one_law_are_not_exported_for_another(capsys):

@@ -25,10 +25,11 @@ sys.exit({1}())
     ("name", "words", "absent", "told"),
     [
         ("report", [BAG, "--structure", "fopdt", "-o", "tune.html"], ["jinja2"], "[report]"),
-        ("csv_to_bag", [str(ROOT / "bags/heater.csv"), "bag"], ["yaml"], "[bags]"),
+        ("csv_to_bag", [str(ROOT / "bags/heater.csv"), "bag"], ["yaml"], "pip install '.[bags]'"),
         ("relay_node", [], ["rclpy"], "make setup"),
         ("apply_gains", [], ["rclpy"], "make setup"),
         ("simulated_loop", [], ["rclpy"], "make setup"),
+        ("tune_loop", ["--measurement", "/a", "--command", "/b"], ["rclpy"], "make setup"),
     ],
 )
 def test_a_missing_package_is_told_in_one_line(name, words, absent, told, tmp_path) -> None:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import xml.etree.ElementTree as ElementTree
 
@@ -15,8 +16,9 @@ from relay_autotune.process.transfer_function import (
     TransferFunction,
     process_latex,
     process_mathml,
+    process_text,
 )
-from relay_autotune.text import date_text, digits
+from relay_autotune.text import date_text, digits, percent
 
 MODELS = {
     "1.650 e^(-10.00 s) / (1 + 20.00 s)": TransferFunction.fopdt(1.65, 20.0, 10.0),
@@ -51,6 +53,28 @@ def test_equal_lags_are_a_power() -> None:
         e for e in ElementTree.fromstring(process_mathml(model)).iter("msup") if e[1].text == "3"
     ]
     assert "".join(power[0].itertext()) == "(1+2.000s)"
+
+
+def test_numbers_that_people_read_have_no_exponent() -> None:
+    told = {
+        203.0: "200",
+        99.6: "100",
+        160.0: "160",
+        2.04: "2.0",
+        12345.0: "12000",
+        1e-7: "1.0e-07",
+    }
+    assert [digits(value, 2) for value in told] == list(told.values())
+    assert [digits(-123456.0), digits(1.5e9)] == ["-123500", "1.500e+09"]
+    assert [percent(x) for x in (0.157, 0.0004, 1.6, math.nan)] == ["16", "0", "160", "-"]
+
+
+def test_a_lag_of_nothing_is_left_out() -> None:
+    model = TransferFunction(2.0, (4e-20,), (3.0, 5e-20), dead_time=0.5)
+    assert process_text(model) == "2.000 e^(-0.5000 s) / (1 + 3.000 s)"
+    assert "e-" not in process_latex(model) and "10" not in process_mathml(model)
+    # It is no share of what there is besides.
+    assert process_text(TransferFunction(2.0, (), (5e-20,))) == "2.000 / (1 + 5.000e-20 s)"
 
 
 def test_numbers_and_dates_that_are_none() -> None:
