@@ -180,7 +180,7 @@ def test_the_papers_iteration_over_harmonics_converges_to_the_exact_time_constan
     tau = time_constant_from_amplitude(2, period, relative)
     assert abs(tau / 3.0 - 1.0) > 0.01
     for _ in range(10):
-        ratio = peak_of_harmonics((tau, tau), period, 200) / fundamental((tau, tau), period)
+        ratio = peak_of_harmonics((tau, tau), period, 100) / fundamental((tau, tau), period)
         tau = time_constant_from_amplitude(2, period, relative / ratio)
     assert tau == pytest.approx(3.0, rel=1e-6)
     assert time_constant_from_amplitude(2, period, relative, EXACT) == pytest.approx(tau, rel=1e-6)

@@ -296,7 +296,7 @@ def test_a_growing_mode_is_tried_where_a_relay_held_the_process(sign):
 
 
 def test_an_integrator_that_is_driven_one_way_is_no_lag_of_many_records():
-    rng, time = np.random.default_rng(0), 0.01 * np.arange(800)
+    rng, time = np.random.default_rng(0), 0.01 * np.arange(1500)
     u = 60.0 + 20.0 * np.sin(time) + 0.15 * np.cumsum(rng.normal(0.0, 1.0, time.size))
     wheel = TransferFunction(6.0, (0.004,), integrators=1)
     y = response(wheel, time, PiecewiseConstant(time, u, 0.0))

@@ -189,6 +189,7 @@ def test_names_and_reasons_from_a_bag_are_text_and_never_html() -> None:
 def test_what_does_not_shake_the_verdict_does_not_head_the_page(
     verdict: Verdict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    only(monkeypatch)
     found = completed()
     models = (replace(found.models[0], warnings=("a load step of -0.211 u",)), *found.models[1:])
     case = replace(case_of(replace(found, models=models), "tank"), record=None, cycles=())
