@@ -9,11 +9,15 @@ import shlex
 import shutil
 import signal
 import subprocess
+from dataclasses import replace
+from typing import Any
 
 import pytest
+from analysed import completed
 from served import REPOSITORY, conversation
 
 from relay_autotune.cli import replay, tune
+from relay_autotune.web import server
 
 COMMANDS = {"replay": replay.main, "tune": tune.main}
 
@@ -52,3 +56,20 @@ def test_a_page_is_served_until_ctrl_c_and_its_command_gives_the_same_gains(word
     found = found["experiments"][0] if "experiments" in found else found
     gains = found["gains"][found["recommended"]]
     assert f"{gains['kc']:.4f}" == shaped["isa"][0][1]
+
+
+def test_the_page_of_a_recording_has_its_units_and_the_command_at_which_it_rests(
+    tmp_path, monkeypatch
+) -> None:
+    found = completed()
+    recorded = replace(found.record, units={"y": "bar", "u": "%"})
+    shown = replace(found, record=recorded)
+    monkeypatch.setattr("relay_autotune.cli.jobs.analyse", lambda *_, **__: shown)
+    pages: list[Any] = []
+    monkeypatch.setattr(server, "run", lambda page, _: pages.append(page))
+    assert replay.main([str(REPOSITORY / "bags/biased_relay"), "--web"]) == 0
+    (page,) = pages
+    page.close()
+    (subject,) = page.subjects
+    assert page.units == subject.target.units == recorded.units
+    assert subject.target.present == recorded.settings.baseline
