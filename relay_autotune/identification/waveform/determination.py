@@ -25,6 +25,7 @@ from relay_autotune.identification.waveform.posterior import Posterior
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Record
+from relay_autotune.text import digits
 
 # Largest factor of the amplitude that is advised.
 _MOST_TIMES = 5.0
@@ -105,8 +106,8 @@ def _for_slow(found: Identification, tests: _Tests) -> list[str]:
         )
     if slowest > 0.0:
         said.append(
-            f"a step of the command held for about {3.0 * slowest:.2g} s, three times the slowest "
-            "lag, would determine gain and time constant"
+            f"a step of the command held for about {digits(3.0 * slowest, 2)} s, three times the "
+            "slowest lag, would determine gain and time constant"
         )
     return said
 
@@ -118,13 +119,13 @@ def _for_fast(found: Identification, names: Sequence[str], tests: _Tests) -> lis
     fast = found.model.dead_time
     if fast < _FEW_SAMPLES * tests.interval:
         said.append(
-            f"faster sampling would help with the {text}: the dead time is {fast:.2g} s, the time "
-            f"between samples {tests.interval:.2g} s"
+            f"faster sampling would help with the {text}: the dead time is {digits(fast, 2)} s, "
+            f"the time between samples {digits(tests.interval, 2)} s"
         )
     else:
         said.append(
             f"a second, slower test with a dead time added to the relay (extra_delay of about "
-            f"{fast:.2g} s), fitted together with this one, would tell the {text} apart"
+            f"{digits(fast, 2)} s), fitted together with this one, would tell the {text} apart"
         )
     return said
 
