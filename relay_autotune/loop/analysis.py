@@ -47,6 +47,8 @@ _DECAY = math.log(1e8)
 _TURNS, _RESETS, _LONGEST = 6.0, 8.0, 64.0
 # Least number of samples of a response, and the largest that are computed one by one.
 _LEAST_SAMPLES, _MOST_SAMPLES = 256, 1 << 14
+# Periods of the controller beyond which 1 - exp(-s h) has no digits left.
+_MOST_PERIODS = 1e12
 _ANGLES = 4096
 # The horizon is long enough if the tail of a response is below this part of the whole.
 _SETTLED = 1e-3
@@ -271,6 +273,11 @@ class Loop:
         :raises TuningError: if the responses do not die away in any reasonable time.
         """
         duration, h = self._horizon(frequency), self.law.period
+        if duration > _MOST_PERIODS * h > 0.0:
+            raise TuningError(
+                f"the responses of the closed loop last {duration / h:.1g} periods of its "
+                "controller: with such small gains it does next to nothing"
+            )
         longest = _LONGEST * duration
         # Twenty instants per period of this frequency, if the number of points allows it.
         finest = min(int(20.0 * duration * frequency / (2.0 * math.pi)), _MOST_POINTS // 8)

@@ -323,6 +323,10 @@ def test_gains_that_a_law_cannot_run_are_refused():
     wild = LAWS["simple_pid"].at(Controller(30.0, 1.0), PERIOD)
     with pytest.raises(TuningError, match="simple_pid runs it every"):
         Loop(wild, PROCESS).performance()
+    # exp(-s h) is 1 to the last digit at the frequencies of so slow a loop.
+    faint = LAWS["simple_pid"].at(Controller(1e-9, 50.0), 1e-5)
+    with pytest.raises(TuningError, match="does next to nothing"):
+        Loop(faint, PROCESS).performance()
 
 
 @pytest.mark.parametrize("name", LAWS)

@@ -109,6 +109,7 @@ def test_of_a_fast_response_a_part_about_the_first_changes_is_used_and_said():
     u = np.where(t < 300.0, 0.0, levels(t, 0.2, rng))
     short = thinned(made(fast, t, u, rng, noise=0.01))
     assert BLOCKS < len(short) <= LEFT_ALONE
+    assert short.unthinned.used < short.unthinned.samples == t.size
     assert short.unthinned.remark.endswith("choose another part with --start and --end")
     changes = short.input().times
     assert np.sum((changes > short.time[0]) & (changes < short.time[-1])) > 50
@@ -173,3 +174,13 @@ def test_what_a_first_order_leaves_of_means_is_not_taken_for_jitter():
     found = identify(short, "waveform")
     assert found.structure == "sopdt"
     assert found.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.02)
+
+
+def test_what_is_left_out_of_samples_that_share_their_times_is_a_share_of_the_samples():
+    """The median time between them is 0 there."""
+    rng = np.random.default_rng(8)
+    t = np.repeat(np.arange(1200) * 0.1, 10)
+    record = made(TransferFunction.fopdt(2.0, 0.05, 0.02), t, levels(t, 0.2, rng), rng)
+    found = analyse(record, alone=True)
+    (left,) = (f for f in found.judgement.findings if f.name == "left_out")
+    assert 0.0 <= left.value < 1.0

@@ -24,6 +24,7 @@ from relay_autotune.identification.methods.thyagarajan import (
     order_from_curvature,
 )
 from relay_autotune.identification.methods.wang import (
+    first_order,
     flat_fopdt,
     fopdt,
     rise_time_constant,
@@ -132,6 +133,14 @@ def test_a_fopdt_process_with_hysteresis(relay, dead_time):
     assert found == pytest.approx((1.5, 1.0, dead_time), rel=1e-9)
     flat = flat_fopdt(s.period, s.amplitude, s.rise, s.rise_half, 2.0, relay.hysteresis)
     assert flat == pytest.approx((1.5, 1.0, dead_time), rel=1e-9)
+
+
+def test_a_half_cycle_of_a_thousand_time_constants_is_nearly_all_dead_time():
+    """exp(2 q) is beyond all numbers there."""
+    for q in (500.0, 1e6):
+        gain, tau, dead_time = first_order(q, 4.0, 2.0, 2.0, 0.1)
+        assert (gain, tau) == (1.0, 1.0 / q)
+        assert dead_time == pytest.approx(2.0, abs=tau)
 
 
 @pytest.mark.parametrize("relay", RELAYS)

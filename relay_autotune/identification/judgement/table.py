@@ -150,8 +150,7 @@ def _left_out(evidence: Evidence) -> Measured | None:
     fitted, record, used = evidence.found.fitted, evidence.record, 1.0
     if record.unthinned is not None:
         # Of a long record with fast responses only a part is looked at.
-        before = record.unthinned
-        used = min(record.duration / (before.samples * before.interval), 1.0)
+        used = record.unthinned.used / record.unthinned.samples
     share = float(np.isnan(fitted).mean()) if len(fitted) else 0.0
     return Measured(1.0 - used * (1.0 - share))
 

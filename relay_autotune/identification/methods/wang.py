@@ -76,9 +76,9 @@ def first_order(q: float, period: float, amplitude: float, relay: float, level: 
     :param level: epsilon [y].
     """
     tau, g = 0.25 * period / q, amplitude / math.tanh(q)
-    # K h - a without the difference of nearly equal numbers.
-    left = 2.0 * amplitude / math.expm1(2.0 * q)
-    return g / relay, tau, tau * math.log((g - level) / left)
+    # (K h - epsilon)/(K h - a) over exp(2 q), without the difference of nearly equal numbers.
+    ratio = (g - level) * -math.expm1(-2.0 * q) / (2.0 * amplitude)
+    return g / relay, tau, 0.5 * period + tau * math.log(ratio)
 
 
 def fopdt_with_gain(
