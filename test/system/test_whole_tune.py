@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""A whole tune of installed executables: in lockstep, with /clock, and in real time."""
+"""A whole tune of installed executables, in lockstep and with /clock."""
 
 from __future__ import annotations
 
@@ -173,44 +173,3 @@ def test_simulated_time_from_end_to_end(rig: Rig) -> None:
     assert model.gain == pytest.approx(2.0, rel=0.05)
     assert model.time_constants[0] == pytest.approx(1.0, rel=0.1)
     assert model.dead_time == pytest.approx(0.5, abs=0.06)
-
-
-@pytest.mark.nightly
-def test_real_time(rig: Rig) -> None:
-    results = Results(rig)
-    rig.plant(
-        sample_period=0.01,
-        structure="fopdt",
-        gain=2.0,
-        time_constants=[0.4],
-        dead_time=0.2,
-        noise_std=0.002,
-        seed=3,
-        operating_point=[5.0, 1.0],
-    )
-    relay = rig.relay(amplitude=0.5, initial_command=1.0, measurement_timeout=3.0)
-    rig.identifier(structure="")
-    answer = rig.tune()
-    rig.until(lambda: results.gains, "gains")
-    # They come by topics of their own.
-    rig.until(lambda: results.models and results.models[-1].final, "the final model")
-    rig.until(lambda: "is closed with model and gains" in relay.log, "closed bag")
-    experiment, model = results.experiments[-1], results.models[-1]
-    assert experiment.outcome == RelayExperiment.COMPLETED
-    # Three stamps: taken, then received, then answered.
-    taken, received, answered = (
-        np.array(getattr(experiment, name)) for name in ("time", "receive_time", "command_time")
-    )
-    assert np.all(received >= taken)
-    assert np.all(answered >= received)
-    assert np.median(answered - taken) < 0.01
-    # A busy machine delays the plant's steps, and the delay is part of the measured loop. The test
-    # in lockstep checks the accuracy.
-    assert model.structure == "fopdt"
-    assert model.gain == pytest.approx(2.0, rel=0.15)
-    assert model.time_constants[0] == pytest.approx(0.4, rel=0.2)
-    assert model.dead_time == pytest.approx(0.2, abs=0.03)
-
-    shown = replay(str(rig.bag(answer)))["experiments"][-1]
-    again = shown["models"][shown["selected"]]
-    assert (again["gain"], again["dead_time"]) == (model.gain, model.dead_time)
