@@ -113,10 +113,13 @@ def difference(found: Identification, record: Record) -> Difference | None:
     whole = max(whole, shortest)
     lag = np.sqrt(np.maximum(edges[:-1], 0.5 * shortest) * edges[1:])
     # An impulse response without jumps has increments as its bins are wide, which is as their lag,
-    # and alike where the lags are (a kernel of correlated decay, Chen, Ohlsson and Ljung 2012).
+    # and alike where the lags are (a kernel of correlated decay, Chen, Ohlsson and Ljung 2012; in
+    # the form of Matern, since the response to what lies between two frequencies of the command
+    # differs little from that to both).
     size = lag / whole * np.exp(-lag / (_DECAY * whole))
-    ratio = np.abs(np.subtract.outer(np.log(lag), np.log(lag)))
-    prior = size[:, None] * np.linalg.cholesky(np.exp(-ratio))
+    ratio = math.sqrt(3.0) * np.abs(np.subtract.outer(np.log(lag), np.log(lag)))
+    alike = (1.0 + ratio) * np.exp(-ratio) + 1e-9 * np.eye(lag.size)
+    prior = size[:, None] * np.linalg.cholesky(alike)
     shown = _posterior(left[known], nuisances[:, known], moved, prior)
     return Difference(edges, shown.mean, shown.root, math.sqrt(float(np.mean(shown.left**2))))
 
