@@ -340,7 +340,8 @@ class RemoteLoop:
         self.command = math.nan
         """The last command received [u]; NaN before the first."""
         self._target = target
-        self._heard_at = 0.0
+        # Silence before the first command counts from here.
+        self._heard_at = time.monotonic()
         self.setpoint = setpoint
         """The set-point in force [y]; NaN: not known."""
         self._setpoints = setpoints
