@@ -135,6 +135,8 @@ def apply_at(name: str, beside: LoopClient, *, doubtful: bool, yes: bool, patien
     options = _parser().parse_args(["--accept-doubtful"] if doubtful else [])
     options.yes, options.stays = yes, False
     with GainsClient("", name, beside) as client:
+        # Who ends it also gives the set-point back, and says so.
+        client.left_behind = ""
         with Working(f"looking for {name}"):
             client.find(patience)
         return apply_and_verify(client, options)

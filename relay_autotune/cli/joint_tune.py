@@ -425,10 +425,10 @@ class JointLoop(Loop):
 
             try:
                 yield why_over
-            except LoopError:
+            except LoopError as error:
                 # A node that is lost leaves the reference where the relay had it.
                 if forward is None:
-                    self._put_back()
+                    raise LoopError(f"{error}; {self._put_back()}") from error
                 raise
 
     def _first_command(self) -> tuple[Any, str]:
@@ -441,20 +441,30 @@ class JointLoop(Loop):
     @property
     def left_behind(self) -> str:
         """What follows where relay_node is lost during a tune."""
-        what = "the controllers" if self._forward else "the reference"
-        return f"{self._loop.joint} gets back {what} of before"
+        # The reference is given back after that, and told then.
+        return f"{self._loop.joint} gets back its controllers of before" if self._forward else ""
 
-    def _put_back(self) -> None:
-        """Give the references back, if the controller that takes them is active."""
+    def _put_back(self) -> str:
+        """Give the reference back where its controller takes it; return how the joint is left."""
+        loop = self._loop
         with suppress(LoopError):
-            if not self.activation():
-                self._give_references_back()
+            if typed := self.activation():
+                return (
+                    f"{self.left()}; type: {typed}; then publish the reference "
+                    f"{loop.state.reference:g} on {loop.reference_topic}"
+                )
+            if not self._give_references_back():
+                return f"{loop.controller} is active, and the reference may still be moved"
+        return self.left()
 
-    def _give_references_back(self) -> None:
-        """Publish the references of before, which the controller forgets when it is switched."""
+    def _give_references_back(self) -> bool:
+        """Publish the references of before, which the controller forgets when it is switched.
+
+        :return: whether the controller has them.
+        """
         loop = self._loop
         if loop.why_not_moved:
-            return
+            return True
         reference = loop.state.reference
         commands = CommandMessage(COMMAND_TYPE, loop.reference_field, loop.references)
         states = message_class(STATE_TYPE, "measurement_type")
@@ -471,6 +481,8 @@ class JointLoop(Loop):
                 f"{loop.controller} is active again, but does not take its former reference "
                 f"{reference:g} for {loop.joint}: publish it on {loop.reference_topic}",
             )
+            return False
+        return True
 
     def activation(self) -> str:
         """Return what to type so that its controller is active; empty: it is.
@@ -555,11 +567,10 @@ class JointLoop(Loop):
                 yes=self.options.yes,
                 patience=START_WITHIN,
             )
-        except GoneError:
+        except GoneError as error:
             # It would have taken its step back.
             self.nodes.end("controller_node")
-            self._put_back()
-            raise
+            raise GoneError(f"{error}; {self._put_back()}") from error
 
     def _set(self) -> int:
         """Set the gains of a controller whose references nobody can move; return the status."""

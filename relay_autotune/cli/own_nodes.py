@@ -183,7 +183,7 @@ class OwnNodes:
                 if status >= 0:
                     return f"{name} has ended: {lines[-1] if lines else f'status {status}'}"
                 by = f"{name} was ended by signal {-status} ({signal.strsignal(-status)})"
-                return f"{by}; its last line: {lines[-1]}" if lines else by
+                return f'{by}, after its line "{lines[-1]}"' if lines else by
         return ""
 
     def __exit__(self, *_: object) -> None:

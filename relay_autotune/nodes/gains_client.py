@@ -61,6 +61,8 @@ class GainsClient(LoopClient):
     def __init__(self, namespace: str, node: str, beside: LoopClient | None = None) -> None:
         super().__init__("apply_gains", namespace, node, beside=beside)
         self._verify = ActionClient(self._node, Verify, f"{node}/verify")
+        self.left_behind = "; its set-point may still be moved"
+        """What follows where the controller_node of another node's gains is lost in a proof."""
 
     def close(self) -> None:
         """Leave the graph."""
@@ -340,7 +342,7 @@ class GainsClient(LoopClient):
             if self.values(target, list(before)) != before:
                 self.set_values(target, before)
             if self.values(target, list(before)) == before:
-                return f"{target} has {told}, as before; its set-point may still be moved"
+                return f"{target} has {told}, as before{self.left_behind}"
         return (
             f"{target} may have the new gains, which are not proven: start {self.name} again, "
             f"which brings {told} back"

@@ -203,7 +203,8 @@ class ControllerManager:
                 state = {each.name: each.state for each in found}.get(controller, "not loaded")
                 if state != _ACTIVE:
                     return (
-                        f"{controller} is {state}: its manager has ended it, and its log says why"
+                        f"{controller} is {state}: it was deactivated, and the log of {self.name} "
+                        f"says when"
                     )
             # An answer that does not come is not waited for.
             if time.monotonic() >= next_at + (_LOST_AFTER if asked is not None else 0.0):
@@ -331,7 +332,7 @@ class Opened:
         manager: ControllerManager,
         forward: str,
         former: tuple[str, ...],
-        then: Callable[[], None],
+        then: Callable[[], object],
     ) -> None:
         self._manager, self._forward, self._former = manager, forward, former
         self._then = then

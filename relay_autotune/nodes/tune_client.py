@@ -160,7 +160,7 @@ class TuneClient(LoopClient):
             )
         else:
             why = self.why_lost() or f"{self.name} has gone, or cannot be heard any more"
-            raise LoopError(f"during the tune {why}: {self.left_behind}")
+            raise LoopError(f"during the tune {why}; {self.left_behind}".rstrip("; "))
 
     def _on_liveliness(self, info: Any) -> None:
         self._alive = info.alive_count > 0

@@ -77,7 +77,7 @@ def test_the_last_line_of_a_node_that_died_ends_every_wait_for_it() -> None:
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ("print('[INFO] [1.5] [loop.relay_node]: at rest'); ", "; its last line: at rest"),
+        ("print('[INFO] [1.5] [loop.relay_node]: at rest'); ", ', after its line "at rest"'),
         ("", ""),
     ],
 )

@@ -254,7 +254,7 @@ def test_controllers_are_off_until_the_relay_ends_and_no_longer(is_open: bool) -
         _first_command=lambda: ("rest", "/one/commands"),
         _client=SimpleNamespace(publishing=lambda *_: publishing),
         _give_references_back=lambda: given.append("references"),
-        _put_back=lambda: given.append("references"),
+        _put_back=lambda: given.append("references") or "the reference is back",
         nodes=SimpleNamespace(why_lost=lambda _: ""),
     )  # fmt: skip
     with JointLoop.opened(tune) as why_over:
@@ -267,7 +267,8 @@ def test_controllers_are_off_until_the_relay_ends_and_no_longer(is_open: bool) -
     assert given == ["command", "references"] * is_open
     # relay_node is lost, and the reference is where the relay had it.
     given.clear()
-    with pytest.raises(LoopError), JointLoop.opened(tune):
+    told = "has ended$" if is_open else "has ended; the reference is back$"
+    with pytest.raises(LoopError, match=told), JointLoop.opened(tune):
         raise LoopError("relay_node has ended")
     assert given == (["command", "references"] if is_open else ["references"])
     assert manager.active == {"pid"}
@@ -454,18 +455,30 @@ def test_a_trajectory_controller_without_gains_in_use_is_refused(parameters, tol
         joint_loop(Arm(**parameters), Arm(), "arm", "arm_2")
 
 
-def test_a_controller_that_is_switched_off_ends_the_proof_and_gets_its_reference(monkeypatch):
+@pytest.mark.parametrize(
+    ("off", "takes", "told"),
+    [
+        (True, True, "pid is off; pid is not active: left has the last effort that it got; "
+         "type: type pid; then publish the reference 1 on /pid/reference"),
+        (False, True, "lost; pid is active, the reference of left is that of before"),
+        (False, False, "lost; pid is active, and the reference may still be moved"),
+    ],
+)  # fmt: skip
+def test_a_proof_that_is_lost_tells_how_its_joint_is_left(monkeypatch, off, takes, told):
     """Without a command of the controller, its controller_node waits for one in vain."""
     manager, did = Switching(), []
     loop = SimpleNamespace(
         controller="pid", node="/pid", places={"p": "p"}, why_not_moved="", clamps=(-1.0, 1.0),
-        feedforward=0.0, state=SimpleNamespace(reference=1.0),
+        feedforward=0.0, state=SimpleNamespace(reference=1.0), joint="left", commanded="effort",
+        reference_topic="/pid/reference",
     )  # fmt: skip
     tune = SimpleNamespace(
         _loop=loop, _manager=manager, _at_controller=lambda: ({}, {}), _space="/tune",
         client=SimpleNamespace(),
         options=SimpleNamespace(keep_gains=False, yes=True, namespace="tune"),
-        _put_back=lambda: did.append("reference"),
+        _put_back=lambda: JointLoop._put_back(tune), left=lambda: JointLoop.left(tune),
+        activation=lambda: JointLoop.activation(tune),
+        _give_references_back=lambda: did.append("reference") or takes,
         nodes=SimpleNamespace(
             start=lambda name, _: did.append(name), end=did.append, why_lost=lambda: ""
         ),
@@ -473,10 +486,22 @@ def test_a_controller_that_is_switched_off_ends_the_proof_and_gets_its_reference
 
     def proof(*_, **__):
         assert tune.client.why_lost() == ""
-        manager.switch([], ["pid"])
-        raise GoneError(tune.client.why_lost())
+        manager.switch([], ["pid"] if off else [])
+        raise GoneError(tune.client.why_lost() or "lost")
 
     monkeypatch.setattr(joint_tune, "apply_at", proof)
-    with pytest.raises(GoneError, match="pid is off"):
+    with pytest.raises(GoneError) as lost:
         JointLoop.apply(tune, "")
-    assert did == ["controller_node", "controller_node", "reference"]
+    assert str(lost.value) == told
+    assert did == ["controller_node", "controller_node"] + ["reference"] * (not off)
+
+
+def test_a_controller_that_was_deactivated_is_told_as_such() -> None:
+    """Its manager, or somebody who has typed it, may have done that."""
+    listed = SimpleNamespace(result=lambda: SimpleNamespace(controller=[]), done=lambda: True)
+    manager = ControllerManager.__new__(ControllerManager)
+    manager.name, manager._kinds = "/cm", {"ListControllers": SimpleNamespace(Request=str)}
+    manager.client = SimpleNamespace(begin=lambda *_: listed)
+    look = manager.still_active("pid")
+    assert look() == ""
+    assert look() == "pid is not loaded: it was deactivated, and the log of /cm says when"

@@ -262,7 +262,7 @@ def test_a_controller_that_dies_during_its_tune_is_told_and_left_as_it_is(robot:
     robot.rig.until(lambda: "stepped to" in tune.log, "the step", 120.0)
     robot.order("die wheel_controller")
     assert tune.wait(60.0) == 1
-    assert "wheel_controller is inactive: its manager has ended it" in tune.log
+    assert "wheel_controller is inactive: it was deactivated" in tune.log
     robot.rig.until(lambda: robot.history() == ["wheel_controller", ""], "the end of it")
 
 
