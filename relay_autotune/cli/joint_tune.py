@@ -92,8 +92,7 @@ class JointLoop(Loop):
                 self._former = in_the_way(loaded, self._forward.needs)
                 self._held = self._commands_beside(self._forward)
         loop = self._loop
-        if not options.namespace:
-            options.namespace = namespace_of_joint(loop.node, loop.joint)
+        options.namespace = namespace_of_joint(loop.node, loop.joint)
         self._space = own_namespace(options)
         if loop.why_not_moved and not options.open:
             raise LoopError(f"{loop.controller} stays as it is: {self._why_not_closed()}")

@@ -399,6 +399,13 @@ def kind_of(options: argparse.Namespace) -> Kind:
 def _require_joint(options: argparse.Namespace) -> None:
     if not (options.controller and options.joint):
         raise SelectionError("--controller and --joint go together: give both")
+    if options.namespace:
+        controller = options.controller.rpartition("/")[2]
+        raise SelectionError(
+            f"--namespace {options.namespace} is that of nodes, not of a robot: leave it out, and "
+            f"name the robot's controller by --controller "
+            f"/{options.namespace.strip('/')}/{controller}"
+        )
     if options.web or (options.json and not (options.keep_gains or options.dry_run)):
         raise SelectionError(
             "a joint is tuned in the terminal: leave out --web, and --json without --keep-gains"

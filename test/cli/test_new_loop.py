@@ -268,6 +268,13 @@ def test_a_law_that_cannot_be_designed_for_is_refused_at_once() -> None:
         kind_of(tune_loop._parser().parse_args(words))
 
 
+def test_the_robot_of_a_joint_is_named_with_its_controller() -> None:
+    """A --namespace beside it was that of the nodes, and the robot of the root was moved."""
+    words = ["--controller", "wheel_pid", "--joint", "left", "--namespace", "robot1"]
+    with pytest.raises(SelectionError, match=r"leave it out.* --controller /robot1/wheel_pid$"):
+        kind_of(tune_loop._parser().parse_args(words))
+
+
 def test_what_is_not_given_is_asked_for_until_it_can_be_read(typed: list[str]) -> None:
     typed += ["two", "2", "30", "30 50", "0, 5"]
     found = arguments(Looker(), options())
