@@ -261,7 +261,8 @@ class AfterTune:
             return self._nothing_started()
         if not options.json:
             paint = Paint(colour=wants_colour(sys.stdout.isatty(), os.environ))
-            left = "" if result.outcome == result.COMPLETED else self.loop.left()
+            ended = result.outcome == result.COMPLETED and not client.cancelled
+            left = "" if ended else self.loop.left()
             lines = result_lines(result, client.cancelled, paint, width(), left)
             print("\n".join(lines), flush=True)
             self._compare()

@@ -201,6 +201,8 @@ def result_lines(
     colour = {"completed": _GREEN}.get(outcome, _RED)
     repeats = _OUTCOME_OF.get(result.why.code) == outcome
     told = result.reason if repeats else f"{outcome}: {result.reason}"
+    if cancelled and result.outcome == result.COMPLETED:
+        told = f"cancelled after the relay had ended, before the gains: {result.reason}"
     first, *rest = labelled("tune", told, columns)
     lines = [first.replace(outcome, paint(outcome, f"{_BOLD};{colour}"), 1), *rest]
     if outcome != "completed":

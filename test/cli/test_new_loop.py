@@ -880,6 +880,23 @@ def test_after_a_tune_beside_another_program_its_command_is_not_said_to_be_the_l
     assert Loop(client, given).left().startswith("the safe command was sent, but a node not known")
 
 
+def test_a_joint_whose_model_was_cancelled_is_said_to_have_its_reference(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found = Tune.Result(outcome=Tune.Result.COMPLETED, reason="no pi_gains: cancelled")
+    found.experiment.experiment_id = "x"
+    client: Any = SimpleNamespace(result=found, refused=(), cancelled=True, succeeded=False)
+    given = tune_loop._parser().parse_args(["--controller", "pid", "--joint", "left"])
+    given.typed = []
+    loop: Any = SimpleNamespace(
+        client=client, options=given, has_own_nodes=True, proves=False,
+        left=lambda: "the reference of left is that of before",
+    )  # fmt: skip
+    assert AfterTune(loop, tune_loop._parser()).conclude() == 1
+    told = capsys.readouterr().out
+    assert "the reference of left is that of before; no gains" in " ".join(told.split())
+
+
 @pytest.mark.parametrize(
     ("other", "passes"),
     [("/t/tune_loop", True), ("/pid", False), ("/pid and /t/tune_loop", False)],

@@ -317,6 +317,14 @@ def test_a_tune_without_gains_offers_none() -> None:
     assert document(stopped, "/relay_node", True)["gains"] is None
 
 
+def test_a_tune_that_was_cancelled_while_its_model_is_computed_says_where_it_was() -> None:
+    reason = "the last 3 of 5 cycles agree within 2 %; no pi_gains: cancelled"
+    found = result(outcome=Tune.Result.COMPLETED, reason=reason, bag="/records/x")
+    first, left, *_ = result_lines(found, True, Paint(), 200, "pid is active")
+    assert first.split(maxsplit=1)[1].startswith("cancelled after the relay had ended, before")
+    assert left.strip() == "pid is active; no gains are given"
+
+
 def test_a_reason_that_begins_with_the_outcome_does_not_repeat_it() -> None:
     reason = "cancelled; 3 samples repeat the one before, since the sensor was silent"
     why = ReasonMessage(code=Code.CANCELLED)
