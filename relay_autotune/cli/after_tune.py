@@ -412,12 +412,16 @@ class AfterTune:
         return proven, steps
 
     def _write(self, written: _Written, file: str) -> None:
+        # The tune is made, and its recording has the gains.
+        bag = shlex.quote(self.result.bag or "BAG")
+        again = f"{prefix()}replay {bag} --export {written.how}"
+        if written.doubt and self.options.export and not self.options.accept_doubtful:
+            again += " --accept-doubtful"
+            say(PROGRAM, f"{file} is not written: the gains are doubtful; to have it: {again}")
+            return
         try:
             text = exported(written.gains, written.how, self.loop.target, doubt=written.doubt)
         except SelectionError as error:
-            # The tune is made, and its recording has the gains.
-            bag = shlex.quote(self.result.bag or "BAG")
-            again = f"{prefix()}replay {bag} --export {written.how}"
             say(PROGRAM, f"{file} is not written: {error}, such as {again}")
             return
         write(text, file)

@@ -539,7 +539,8 @@ class JointLoop(Loop):
             return None
         print()
         if doubt and self.options.yes:
-            raise LoopError(f"the gains are doubtful, so that --yes does not apply them: {doubt}")
+            say(PROGRAM, f"the gains are doubtful, so that --yes does not apply them: {doubt}")
+            return None
         loop = self._loop
         if loop.why_not_moved:
             return self._set()

@@ -135,6 +135,7 @@ SETTINGS = (
         "write the gains for ros2_controllers' pid_controller, or for the controller of the "
         "joint; an existing file is refused at once"
     ),
+    Setting("accept_doubtful", False).means("with --export: also gains that are doubtful"),
 )  # fmt: skip
 SETTING = {each.name: each for each in SETTINGS}
 _FLAGS = {name: flag_of(each) for each in SETTINGS for name in each.parameters}
@@ -388,7 +389,7 @@ def kind_of(options: argparse.Namespace) -> Kind:
     for each in SETTINGS:
         # One with a default is not told from one that is not given.
         if (
-            each.name not in ("amplitude", "field", "yes")
+            each.name not in ("amplitude", "field", "yes", "accept_doubtful")
             and getattr(options, each.name) is not None
         ):
             told = f"is for a loop without nodes: give {' and '.join(lacking)}, too"

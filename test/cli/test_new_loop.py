@@ -691,9 +691,12 @@ def shown(
         command_type: str = FLOAT64,
         bag: str | None = None,
         command_within: list[float] | None = given.command_within,
+        export: str | None = None,
+        accept_doubtful: bool = False,
     ) -> str:
         typed.extend(answers)
         given.command_within = command_within
+        given.export, given.accept_doubtful = export, accept_doubtful
         result.bag = tempfile.mkdtemp(dir=tmp_path) if bag is None else bag
         kinds["command_type"] = command_type
         monkeypatch.setattr(AfterTune, "_offered", lambda _: (passed, against))
@@ -733,6 +736,16 @@ def test_gains_that_failed_are_not_recommended_and_their_file_says_so(
     assert "start your own controller with these gains" in shown(True, "", "passed.yaml")
     text = (tmp_path / "passed.yaml").read_text()
     assert "DOUBTFUL" not in text and "u_clamp_max: 100.0" in text
+
+
+def test_doubtful_gains_are_exported_unasked_by_a_flag_alone(
+    shown: Callable[..., str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    file = tmp_path / "gains.yaml"
+    shown(None, "few cycles", bag="tune", export=str(file))
+    assert not file.exists()
+    shown(None, "few cycles", export=str(file), accept_doubtful=True)
+    assert file.read_text().startswith("# DOUBTFUL: few cycles")
 
 
 def test_a_program_that_is_named_gets_gains_of_its_own_and_a_start_without_a_bump(
