@@ -31,7 +31,8 @@ from relay_autotune.cli.arguments import (
     given_quantities,
     say,
 )
-from relay_autotune.cli.table import rows, table
+from relay_autotune.cli.table import compared_lines, rows, table
+from relay_autotune.cli.terminal import WIDEST
 from relay_autotune.errors import NotThereError, RelayAutotuneError, SelectionError, defect
 from relay_autotune.exchange.export import EXPORTS, WITHOUT_LAW, Target, exported
 from relay_autotune.identification.known import Known
@@ -133,6 +134,9 @@ def replay(
         if job.export is not None:
             gains, text = _exported(analyses, *job.export, accept_doubtful=job.accept_doubtful)
             said += [f"{job.name}: {warning}" for warning in gains.warnings]
+            for each in analyses:
+                if lines := compared_lines(each, job.present, job.table_width or WIDEST):
+                    said.append("\n".join([f"{job.name}:", *lines]))
             return Done(job.name, status_of(analyses), tuple(said), text), analyses
     except SelectionError as error:
         command = shlex.join(("replay", *job.paths))

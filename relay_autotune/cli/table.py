@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,12 +61,25 @@ def table(
         which = f" {number} of {len(analyses)}" if len(analyses) > 1 else ""
         with told_in(analysis.record.units):
             blocks.append("\n".join(_laid_out(_experiment(analysis, which), width)))
-            model, gains = analysis.model, analysis.best_gains
-            if present is not None and model is not None and gains is not None:
-                slower = model.model.dead_time + analysis.added_delay
-                process = replace(model.model, dead_time=slower)
-                blocks.append("\n".join(beside(present, gains, process, width, head="present")))
+            if compared := compared_lines(analysis, present, width):
+                blocks.append("\n".join(compared))
     return "\n\n".join(blocks) + "\n"
+
+
+def compared_lines(
+    analysis: Analysis, present: Controller | None, width: int = WIDEST
+) -> list[str]:
+    """Return the present gains beside the new ones; empty: either are not there.
+
+    :param analysis: of an experiment.
+    :param present: the gains that the controller has now; None: not known.
+    :param width: columns that a line may have.
+    """
+    model, gains = analysis.model, analysis.best_gains
+    if present is None or model is None or gains is None:
+        return []
+    with told_in(analysis.record.units):
+        return beside(present, gains, model.model, width, "present", analysis.added_delay)
 
 
 # Columns of a table with one line for each experiment, and their widths.
@@ -164,21 +176,22 @@ def beside(
     gains: Gains,
     model: TransferFunction,
     width: int = WIDEST,
-    *,
     head: str = "in force",
+    added_delay: float = math.nan,
 ) -> list[str]:
     """Return the present gains and the new ones, with what each does on the model.
 
     :param present: the present gains; None: there are none.
     :param gains: the new ones.
-    :param model: the process with the dead time of the loop.
+    :param model: the process.
     :param width: columns that a line may have.
     :param head: what stands above the present gains.
+    :param added_delay: as of `performance_beside`.
     """
     # here, for it loads scipy: a tune is shown with this module, and begins before that
-    from relay_autotune.loop.analysis import difference, performance_on
+    from relay_autotune.loop.analysis import difference, performance_beside
 
-    now = None if present is None else performance_on(present, model)
+    now = None if present is None else performance_beside(present, gains, model, added_delay)
     rows = [["", head, "new", ""]]
     for name, unit in _FIGURES:
         old = "none" if present is None else digits(getattr(present, name))

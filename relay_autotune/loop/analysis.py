@@ -21,6 +21,7 @@ other sign)``: the first is the transform at s = 0, so that a slow tail needs no
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -28,8 +29,8 @@ import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import RelayAutotuneError, TuningError
-from relay_autotune.loop.gains import ControlLaw, Controller, Performance, StepFigures
-from relay_autotune.loop.laws import LAWS, OWN_LAW, SampledLaw
+from relay_autotune.loop.gains import ControlLaw, Controller, Gains, Performance, StepFigures
+from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate, SampledLaw
 from relay_autotune.loop.stability import (
     LoopMargins,
     closed_loop_unstable_poles,
@@ -418,14 +419,27 @@ def analyse_loop(
     return Loop(controller, model).performance()
 
 
-def performance_on(controller: Controller, model: TransferFunction) -> Performance | None:
-    """Return the performance of gains of any origin on a model; None: the loop is unstable.
+def performance_beside(
+    present: Controller, new: Gains | None, model: TransferFunction, added_delay: float = math.nan
+) -> Performance | None:
+    """Return the performance of gains of any origin, run as new ones; None: the loop is unstable.
 
-    :param controller: the gains.
-    :param model: the process, with all dead time of the loop.
+    :param present: the gains; where the law of the new ones cannot run them, they run
+        continuously, with the dead time of its hold.
+    :param new: those that they are compared with; None: the present ones run continuously.
+    :param model: the process.
+    :param added_delay: dead time of the loop beside it [s]; NaN: that of the law's hold alone.
     """
+    rate = LawRate(LAWS[new.law], new.law_period) if new and new.law in LAWS else None
+    hold = rate.law.lag(rate.period) if rate else 0.0
+    delay = hold if math.isnan(added_delay) else added_delay
+    law: ControlLaw = present
+    if rate:
+        with suppress(TuningError):
+            law = rate.of(present)
+            delay -= hold
     try:
-        return analyse_loop(controller, model)
+        return analyse_loop(law, replace(model, dead_time=max(model.dead_time + delay, 0.0)))
     except TuningError:
         return None
 

@@ -9,10 +9,10 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from relay_autotune.loop.analysis import difference, performance_on
+from relay_autotune.loop.analysis import difference, performance_beside
 from relay_autotune.loop.gains import Controller, Performance
 from relay_autotune.record.record import Outcome
-from relay_autotune.report.case import Case, in_loop
+from relay_autotune.report.case import Case
 from relay_autotune.text import date_text, digits, percent
 from relay_autotune.verdict import Finding, Result, Verdict
 
@@ -190,7 +190,7 @@ def performance_of(present: Controller, case: Case) -> Performance | None:
     """
     if case.model is None:
         return None
-    return performance_on(present, in_loop(case, case.model.found.model))
+    return performance_beside(present, case.best_gains, case.model.found.model, case.added_delay)
 
 
 def compared_numbers(gains: Controller, does: Performance | None) -> list[tuple[str, str, str]]:

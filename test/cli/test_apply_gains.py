@@ -22,6 +22,7 @@ from relay_autotune.cli.tune_page import GainsPage
 from relay_autotune.control.verification import StepRange
 from relay_autotune.errors import LoopError, TuningError
 from relay_autotune.exchange.messages import fill_gains, fill_reason
+from relay_autotune.loop.analysis import performance_beside
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.verifier import without_arrays
 from relay_autotune.process.transfer_function import TransferFunction
@@ -62,6 +63,17 @@ def test_old_and_new_gains_stand_side_by_side_with_what_they_do() -> None:
     error = next(line for line in lines if "error after a load step" in line)
     assert float(error.split()[5]) == pytest.approx(3.0 / 0.1, rel=1e-3)
     assert float(error.split()[6]) == pytest.approx(GAINS.iae_load, rel=1e-2)
+
+
+@pytest.mark.parametrize("law", ["oscat_ft_pid", "control_toolbox_legacy", "simple_pid"])
+def test_the_same_gains_do_the_same_by_the_law_of_the_new_ones(law: str) -> None:
+    """Continuously their overshoot and Ms were others: the comparison told a change of nothing."""
+    options = DesignOptions(law=law, sample_period=0.3, loop_delay=0.1)
+    new = design(DesignTask(model=MODEL, options=options), "robust")
+    same = Controller(new.kc, new.ti, new.td)
+    found = performance_beside(same, new, MODEL, options.added_delay)
+    assert found is not None
+    assert (found.ms, found.overshoot) == pytest.approx((new.ms, new.overshoot), rel=1e-3)
 
 
 def test_gains_that_are_missing_or_unstable_are_told_as_such() -> None:

@@ -232,5 +232,9 @@ def test_the_table_has_the_present_gains_beside_the_new_ones(
         [expected.ms, found.best_gains.ms], rel=0.01
     )
     assert "the new gains are " in told
+    # A file of gains on standard output leaves the comparison to standard error.
+    assert replay.main([logs[0], *present, "--export", "pid_controller"]) == 0
+    file, beside = capsys.readouterr()
+    assert row in [line.split() for line in beside.splitlines()] and "  Ms  " not in file
     assert replay.main([*logs, *present]) == 2
     assert "--present is of one loop, and 2 are given" in capsys.readouterr().err
