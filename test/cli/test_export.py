@@ -394,6 +394,8 @@ def test_replay_writes_the_gains_for_the_cycle_that_the_recording_shows(tmp_path
     assert shown.out == ""
     text = file.read_text()
     assert "CYCLE := T#98.5ms;" in text
+    # A block whose error is a share of a measuring range would get a gain far too low.
+    assert "// KP is in u/y: a block that scales to measuring ranges takes" in text
     # The tank of this recording rests at 30 before its steps.
     found = settings_of(text)
     assert float(found["KP"]) * float(found["X0"]) == pytest.approx(30.0)
