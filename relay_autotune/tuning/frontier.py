@@ -327,7 +327,9 @@ def first_crossing(distance: FloatArray, ki: FloatArray, kp: FloatArray) -> Floa
     near = np.maximum(np.abs(before), np.abs(after)) < _NEAR * kp[:, None, None]
     marginal = crosses & near & ((ki[..., :-1] > 0.0) != (ki[..., 1:] > 0.0))
     at = np.where(marginal, 0.0, at)
-    return np.where(crosses & ((at > 0.0) | marginal), at, math.inf).min(axis=-1)
+    found = np.where(crosses & ((at > 0.0) | marginal), at, math.inf)
+    # Of a grid of one frequency, below which a sampled loop has no other, nothing is told.
+    return np.asarray(found.min(axis=-1, initial=math.inf))
 
 
 def _highest_gap(

@@ -18,7 +18,7 @@ from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate
 from relay_autotune.process.structures import UNSTABLE_FOPDT, UNSTABLE_SOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import design
-from relay_autotune.tuning.frontier import Bounds
+from relay_autotune.tuning.frontier import Bounds, first_crossing
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.search import Search
 from relay_autotune.tuning.task import DesignOptions, DesignTask
@@ -239,3 +239,9 @@ def test_models_of_a_far_longer_dead_time_slow_the_loop_down():
     others = tuple(replace(process, dead_time=80.0 + 0.2 * k) for k in range(20))
     gains = robust(DesignTask(model=process, models=others, options=DesignOptions()))[0]
     assert max(analyse_loop(gains, m).ms for m in others) == pytest.approx(1.4, rel=0.02)
+
+
+def test_a_grid_of_one_frequency_shows_no_crossing():
+    """Far above half of the sampling rate a loop has no other frequency."""
+    found = first_crossing(np.ones((1, 4, 1)), np.ones((1, 4, 1)), np.ones(1))
+    np.testing.assert_array_equal(found, np.full((1, 4), math.inf))
