@@ -24,6 +24,7 @@ from relay_autotune.identification.waveform.starts import (
     latest_dead_time,
     multistart,
     start_fopdt,
+    time_scales,
 )
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import RelayRun, simulate_relay
@@ -375,6 +376,13 @@ def test_few_samples_do_not_meet_a_periodic_command_at_one_instant_each_time():
     y += rng.normal(0.0, 0.02, time.size)
     log_tau, _ = start_fopdt(problem_of([(time, y, u)], TABLE["fopdt"]))[0]
     assert 0.003 < math.exp(log_tau) < 0.008
+
+
+def test_a_command_that_changes_after_the_last_of_a_few_samples_has_time_scales():
+    time = np.arange(0.0, 20.0, 0.1)
+    late = problem_of([(time, time, PiecewiseConstant([19.85], [1.0], 0.0))], TABLE["fopdt"])
+    assert time_scales(late) == pytest.approx((0.1, 0.05))
+    assert time_scales(late.thinned(20)) == pytest.approx((1.0, 19.0))
 
 
 def test_a_fit_ends_where_lags_far_below_the_period_explain_nothing_more():

@@ -173,7 +173,7 @@ def changes_within(u: Input, time: FloatArray) -> FloatArray:
 def time_scales(problem: Problem) -> tuple[float, float]:
     """Return the shortest time that samples resolve, and the longest possible dead time [s].
 
-    :param problem: its inputs change within the samples.
+    :param problem: its inputs change within the samples, or between those that were left out.
     """
     scales = []
     for part, u in zip(problem.experiments, problem.inputs, strict=True):
@@ -181,7 +181,7 @@ def time_scales(problem: Problem) -> tuple[float, float]:
         gaps = np.diff(time)
         shortest = float(np.median(gaps[gaps > 0.0]))
         inside = changes_within(u, time)
-        rest = float(time[-1] - inside[0])
+        rest = float(time[-1] - (inside[0] if inside.size else time[0]))
         if inside.size > _MOST_SWITCHES * time.size and isinstance(u, PiecewiseConstant):
             # A controller moves a little at each sample, and far when its set-point is switched.
             steps = np.abs(np.diff(u.values, prepend=u.initial))
