@@ -85,6 +85,15 @@ def find_experiments(record: Record) -> tuple[Stretch, ...]:
     return tuple(found)
 
 
+def changes_within(u: Input, time: FloatArray) -> FloatArray:
+    """Return when an input changes between the first and the last sample [s].
+
+    :param u: the input.
+    :param time: of the samples [s], shape (n,).
+    """
+    return np.asarray(u.times[(u.times >= time[0]) & (u.times < time[-1])])
+
+
 def begins_at_rest(time: FloatArray, y: FloatArray, u: Input) -> bool:
     """Return whether an experiment begins with a rest, which shows what came before.
 
@@ -92,7 +101,7 @@ def begins_at_rest(time: FloatArray, y: FloatArray, u: Input) -> bool:
     :param y: the measurement, shape (n,).
     :param u: the input.
     """
-    changes = u.times[(u.times >= time[0]) & (u.times < time[-1])]
+    changes = changes_within(u, time)
     before = time < (changes[0] if changes.size else time[0])
     if np.count_nonzero(before) < _ENOUGH_REST or not np.ptp(time[before]) > 0.0:
         return False

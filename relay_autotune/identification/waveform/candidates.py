@@ -35,7 +35,6 @@ from relay_autotune.identification.waveform.separable import (
 from relay_autotune.identification.waveform.starts import (
     Guess,
     best_of,
-    changes_within,
     coarse,
     is_unobservable,
     latest_dead_times,
@@ -58,7 +57,7 @@ from relay_autotune.process.structures import (
     Structure,
 )
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.excitation import begins_at_rest
+from relay_autotune.record.excitation import begins_at_rest, changes_within
 from relay_autotune.record.record import PiecewiseConstant
 
 MOST_LAGS = 8

@@ -43,8 +43,8 @@ from relay_autotune.identification.waveform.separable import (
     problem_of,
     refine,
 )
-from relay_autotune.identification.waveform.starts import changes_within
 from relay_autotune.process.structures import FOPDT, TABLE
+from relay_autotune.record.excitation import changes_within
 from relay_autotune.record.record import Input, Record
 
 # Number of samples from which even a coarse measurement takes more than two values.

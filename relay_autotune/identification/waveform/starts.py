@@ -30,6 +30,7 @@ from relay_autotune.process.response import response
 from relay_autotune.process.structures import Structure
 from relay_autotune.process.transfer_function import Quadratic, TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.excitation import changes_within
 from relay_autotune.record.record import Input, PiecewiseConstant
 
 # Least number of samples in each period of an oscillation of the process.
@@ -159,15 +160,6 @@ _SHARES = (
     *(0.0, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.67, 0.8, 0.95),
     *(1.2, 1.5, 1.9, 2.4),
 )
-
-
-def changes_within(u: Input, time: FloatArray) -> FloatArray:
-    """Return when an input changes between the first and the last sample [s].
-
-    :param u: the input.
-    :param time: of the samples [s], shape (n,).
-    """
-    return np.asarray(u.times[(u.times >= time[0]) & (u.times < time[-1])])
 
 
 def time_scales(problem: Problem) -> tuple[float, float]:
