@@ -477,17 +477,10 @@ def needs_no_past(problem: Problem, sign: int) -> bool:
     :param problem: all samples.
     :param sign: the direction in which the relay worked, 1 or -1; 0: not known.
     """
-    changes = (
-        changes_within(u, problem.time[part])
+    return not sign and all(
+        changes_within(u, problem.time[part]).size < _MANY
+        and begins_at_rest(problem.time[part], problem.y[part], u)
         for part, u in zip(problem.experiments, problem.inputs, strict=True)
-    )
-    return (
-        not sign
-        and all(c.size < _MANY for c in changes)
-        and all(
-            begins_at_rest(problem.time[part], problem.y[part], u)
-            for part, u in zip(problem.experiments, problem.inputs, strict=True)
-        )
     )
 
 
