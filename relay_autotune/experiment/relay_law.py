@@ -4,16 +4,18 @@
 """The relay: when it switches, how long it waits for a return, and its two command levels.
 
 The lengths of its stays tell which switches begin a cycle. The levels are given, or grown from
-small to large within the limits.
+small to large within the limits, and shifted against a load.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.experiment.parameters import FIRST_SHARE, ExperimentParameters
 from relay_autotune.reasons import Code, Reason
+from relay_autotune.record.record import Cycle
 
 
 class Relay:
@@ -368,6 +370,69 @@ class Levels:
             return 1.0
         ratio = _TO_SPARE * least / half_swing if half_swing > 0.0 else math.inf
         return min(max(ratio, _LEAST_GROWTH), _MOST_GROWTH)
+
+
+# The share of the high level in a period is known when two cycles agree within the first number; a
+# later change by more than the second number means a load. A load that stops the oscillation is
+# compensated by shifts of a part of the amplitude, a limited number at a time.
+_SAME_SHARE, _OTHER_SHARE = 0.03, 0.08
+_MOST_SHIFTS, _SHIFT = 2, 0.7
+MOST_COMPENSATED = 4
+"""Number of stays that may need a shift: a load that comes and goes twice. A process that needs it
+at every turn does not oscillate."""
+
+
+class LoadCompensation:
+    """Shift the levels against a load, which changes the mean command that the process needs."""
+
+    def __init__(self, levels: Levels, notes: list[Reason]) -> None:
+        self._levels, self._notes = levels, notes
+        self._share = math.nan
+        self.shifts = 0
+        """Number of shifts in the present stay."""
+        self.compensated = 0
+        """Number of stays that needed one."""
+        self.at = -math.inf
+        """Time of the last one [s]."""
+        self.waits_from = -math.inf
+        """Instant from which the limit of the present stay counts, at the earliest [s]."""
+
+    def shows_in(self, last: Sequence[Cycle]) -> bool:
+        """Compensate a load by the share of the high level; return True if there was one.
+
+        :param last: the last two cycles, or the only one.
+        """
+        share = [c.period_high / c.period if c.period > 0.0 else 0.5 for c in last]
+        if math.isnan(self._share):
+            if len(share) == 2 and abs(share[1] - share[0]) < _SAME_SHARE:
+                self._share = share[1]
+            return False
+        change = share[-1] - self._share
+        # After a disturbed cycle a small change counts too: the rest of the same load.
+        if abs(change) <= (_SAME_SHARE if last[0].disturbed else _OTHER_SHARE):
+            return False
+        self._shift(2.0 * change * self._levels.amplitude)
+        return True
+
+    def may_push(self) -> bool:
+        """Return True if the levels may be shifted for a measurement that does not come back."""
+        return self.shifts < _MOST_SHIFTS if self.shifts else self.compensated < MOST_COMPENSATED
+
+    def push(self, sign: int) -> None:
+        """Shift the levels by a part of the amplitude, up (1) or down (-1)."""
+        self._shift(sign * _SHIFT * self._levels.amplitude)
+
+    def pushed(self, t: float, limit: float) -> None:
+        """Note that the command has moved with the levels, and give it half of a limit again."""
+        self.compensated += not self.shifts
+        self.shifts += 1
+        self.at, self.waits_from = t, t - 0.5 * limit
+
+    def _shift(self, by: float) -> None:
+        self._levels.shift(by)
+        note = Code.NOTE_LOAD()
+        if note not in self._notes:
+            self._notes.append(note)
 
 
 def clear_swing(noise_std: float, hysteresis: float, measurement: FloatArray) -> float:

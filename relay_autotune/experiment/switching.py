@@ -26,9 +26,10 @@ from relay_autotune.experiment.faults import (
 )
 from relay_autotune.experiment.phases import Answer, Ended, Facts, Setup, State, failed, kick_limit
 from relay_autotune.experiment.relay_law import (
+    MOST_COMPENSATED,
     DwellFilter,
     DwellLimit,
-    Levels,
+    LoadCompensation,
     Relay,
     ample_swing,
     clear_swing,
@@ -42,14 +43,6 @@ from relay_autotune.text import duration
 # Two instants that differ by less than this part of the sample interval are equal.
 _ROUNDING = 1e-6
 
-# The share of the high level in a period is known when two cycles agree within the first number; a
-# later change by more than the second number means a load. A load that stops the oscillation is
-# compensated by shifts of a part of the amplitude, a limited number at a time.
-_SAME_SHARE, _OTHER_SHARE = 0.03, 0.08
-_MOST_SHIFTS, _SHIFT = 2, 0.7
-MOST_COMPENSATED = 4
-"""Number of stays that may need a shift: a load that comes and goes twice. A process that needs it
-at every turn does not oscillate."""
 _FOLLOWS = 2
 # Ratio of a cycle to the one before beyond which it is no sign of a load yet.
 _ALONE = 4.0
@@ -150,59 +143,6 @@ class _FastWatch:
         return Code.FAST_IN_CYCLE(switches=count, cycles=cycles, most=most)
 
 
-class _Load:
-    """Shift the levels against a load, which changes the mean command that the process needs."""
-
-    def __init__(self, levels: Levels, notes: list[Reason]) -> None:
-        self._levels, self._notes = levels, notes
-        self._share = math.nan
-        self.shifts = 0
-        """Number of shifts in the present stay."""
-        self.compensated = 0
-        """Number of stays that needed one."""
-        self.at = -math.inf
-        """Time of the last one [s]."""
-        self.waits_from = -math.inf
-        """Instant from which the limit of the present stay counts, at the earliest [s]."""
-
-    def shows_in(self, last: Sequence[Cycle]) -> bool:
-        """Compensate a load by the share of the high level; return True if there was one.
-
-        :param last: the last two cycles, or the only one.
-        """
-        share = [c.period_high / c.period if c.period > 0.0 else 0.5 for c in last]
-        if math.isnan(self._share):
-            if len(share) == 2 and abs(share[1] - share[0]) < _SAME_SHARE:
-                self._share = share[1]
-            return False
-        change = share[-1] - self._share
-        # After a disturbed cycle a small change counts too: the rest of the same load.
-        if abs(change) <= (_SAME_SHARE if last[0].disturbed else _OTHER_SHARE):
-            return False
-        self._shift(2.0 * change * self._levels.amplitude)
-        return True
-
-    def may_push(self) -> bool:
-        """Return True if the levels may be shifted for a measurement that does not come back."""
-        return self.shifts < _MOST_SHIFTS if self.shifts else self.compensated < MOST_COMPENSATED
-
-    def push(self, sign: int) -> None:
-        """Shift the levels by a part of the amplitude, up (1) or down (-1)."""
-        self._shift(sign * _SHIFT * self._levels.amplitude)
-
-    def pushed(self, t: float, limit: float) -> None:
-        """Note that the command has moved with the levels, and give it half of a limit again."""
-        self.compensated += not self.shifts
-        self.shifts += 1
-        self.at, self.waits_from = t, t - 0.5 * limit
-
-    def _shift(self, by: float) -> None:
-        self._levels.shift(by)
-        note = Code.NOTE_LOAD()
-        if note not in self._notes:
-            self._notes.append(note)
-
-
 class _Course:
     """The switching since the relay began, with one amplitude that counts, and one sign.
 
@@ -259,7 +199,7 @@ class Switching:
         # A sign that was found may have to be reversed.
         self._is_doubtful = setup.parameters.process_gain_sign == 0
         self._kick_amplitude = setup.levels.amplitude
-        self._load = _Load(setup.levels, setup.notes)
+        self._load = LoadCompensation(setup.levels, setup.notes)
         self._furthest = math.inf
         self._away = 0
         self._begin()

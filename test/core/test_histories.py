@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.phases import GAP, Samples
-from relay_autotune.experiment.relay_law import OVERDUE, DwellFilter
-from relay_autotune.experiment.switching import MOST_COMPENSATED
+from relay_autotune.experiment.relay_law import MOST_COMPENSATED, OVERDUE, DwellFilter
 from relay_autotune.record.record import Outcome
 
 PART = 30

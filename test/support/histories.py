@@ -21,8 +21,7 @@ import numpy as np
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.phases import GAP, KICK_LIMIT, KICK_SETTLINGS
-from relay_autotune.experiment.relay_law import OVERDUE, OVERDUE_SAMPLES
-from relay_autotune.experiment.switching import MOST_COMPENSATED
+from relay_autotune.experiment.relay_law import MOST_COMPENSATED, OVERDUE, OVERDUE_SAMPLES
 from relay_autotune.record.record import Outcome
 
 HAPPENINGS = (
