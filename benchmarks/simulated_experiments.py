@@ -22,14 +22,12 @@ import json
 import math
 import sys
 import time as wall
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TextIO
 
 from random_experiments import Experiment, with_delay
-
-# isort: split
-from simulated_summary import summary
+from simulated_summary import Result, summary
 
 import relay_autotune
 from relay_autotune.analysis import analyse
@@ -44,60 +42,6 @@ from relay_autotune.tuning.task import DesignOptions
 
 EXPERIMENTS = 10_000
 QUICK = 4
-
-
-@dataclass
-class Result:
-    """The result of one experiment.
-
-    :param seed: of the experiment.
-    :param state: of the code.
-    :param happening: what happened in it.
-    :param structure: of the true process.
-    :param ratio: noise-to-signal ratio.
-    :param per_cycle: samples in a cycle.
-    :param finds_amplitude: True if the amplitude was not given.
-    :param outcome: of the experiment.
-    :param cycles: whole cycles.
-    :param delay: samples from the cause of the end to the safe command; -1: there was no cause.
-    :param late: see :class:`Experiment`.
-    :param unsafe: see :class:`Experiment`.
-    :param gains: whether there are gains.
-    :param reason: why it did not complete, or why there are no gains.
-    :param found: structure of the model.
-    :param stable: whether the loop on the true process is stable.
-    :param ms: its Ms with the loop's own delay; NaN: none.
-    :param asked: what the gains' reason says of Ms; NaN: none.
-    :param gain_error: relative error of K_u; NaN: no model.
-    :param gain_std: its standard deviation, relative.
-    :param frequency_error: relative error of w_u.
-    :param frequency_std: its standard deviation, relative.
-    :param seconds: of a processor that it took.
-    """
-
-    seed: int
-    state: str
-    happening: str
-    structure: str
-    ratio: float
-    per_cycle: int
-    finds_amplitude: bool
-    outcome: str = ""
-    cycles: int = 0
-    delay: int = -1
-    late: bool = False
-    unsafe: bool = False
-    gains: bool = False
-    reason: str = ""
-    found: str = ""
-    stable: bool = True
-    ms: float = math.nan
-    asked: float = math.nan
-    gain_error: float = math.nan
-    gain_std: float = math.nan
-    frequency_error: float = math.nan
-    frequency_std: float = math.nan
-    seconds: float = 0.0
 
 
 def state_of_code() -> str:

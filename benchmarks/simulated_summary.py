@@ -1,13 +1,14 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tables of the results of simulated experiments."""
+"""Results of simulated experiments, and their tables."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 from markdown import table
@@ -15,12 +16,63 @@ from random_experiments import DISTURBANCES, FAULTS, HAPPENINGS, NOTHING
 
 from relay_autotune.quantities import NORMAL_95
 
-if TYPE_CHECKING:
-    from simulated_experiments import Result
-
 MOST_REFUSED = 5.0
 LEAST_CYCLES = 3
 _RATIOS = (0.0, 0.05, 0.1, 0.15, 0.2)
+
+
+@dataclass
+class Result:
+    """The result of one experiment.
+
+    :param seed: of the experiment.
+    :param state: of the code.
+    :param happening: what happened in it.
+    :param structure: of the true process.
+    :param ratio: noise-to-signal ratio.
+    :param per_cycle: samples in a cycle.
+    :param finds_amplitude: True if the amplitude was not given.
+    :param outcome: of the experiment.
+    :param cycles: whole cycles.
+    :param delay: samples from the cause of the end to the safe command; -1: there was no cause.
+    :param late: see :class:`Experiment`.
+    :param unsafe: see :class:`Experiment`.
+    :param gains: whether there are gains.
+    :param reason: why it did not complete, or why there are no gains.
+    :param found: structure of the model.
+    :param stable: whether the loop on the true process is stable.
+    :param ms: its Ms with the loop's own delay; NaN: none.
+    :param asked: what the gains' reason says of Ms; NaN: none.
+    :param gain_error: relative error of K_u; NaN: no model.
+    :param gain_std: its standard deviation, relative.
+    :param frequency_error: relative error of w_u.
+    :param frequency_std: its standard deviation, relative.
+    :param seconds: of a processor that it took.
+    """
+
+    seed: int
+    state: str
+    happening: str
+    structure: str
+    ratio: float
+    per_cycle: int
+    finds_amplitude: bool
+    outcome: str = ""
+    cycles: int = 0
+    delay: int = -1
+    late: bool = False
+    unsafe: bool = False
+    gains: bool = False
+    reason: str = ""
+    found: str = ""
+    stable: bool = True
+    ms: float = math.nan
+    asked: float = math.nan
+    gain_error: float = math.nan
+    gain_std: float = math.nan
+    frequency_error: float = math.nan
+    frequency_std: float = math.nan
+    seconds: float = 0.0
 
 
 def summary(results: Sequence[Result]) -> tuple[str, bool]:
