@@ -144,6 +144,7 @@ class _LoopOnPage:
         """
         status = DONE
         self._interrupted = interrupted
+        self._live.tell(status="nothing is commanded before a tune is started here")
         try:
             self._show_signals()
             self._show_form()

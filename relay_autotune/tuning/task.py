@@ -208,7 +208,7 @@ def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:
     if known and noise > _HELD * options.noise_share * options.amplitude:
         found.append(
             f"the noise alone moves the command by {noise:.3g} (standard deviation), "
-            f"{100.0 * noise / options.amplitude:.0f} % of the relay's amplitude; filter the "
+            f"{100.0 * noise / options.amplitude:.0f} % of half the command's range; filter the "
             "measurement, or ask for PI"
         )
     return tuple(found)

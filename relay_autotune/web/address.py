@@ -61,7 +61,7 @@ class Address:
         """
         host = self.host
         if host in ("0.0.0.0", "::"):
-            host = socket.gethostname()
+            host = _own_number(host)
         shown = f"[{host}]" if ":" in host else host
         return f"http://{shown}:{port}/" + (f"?token={self.token}" if self.token else "")
 
@@ -80,6 +80,21 @@ def address_of(text: str) -> Address:
     if not re.fullmatch(r"[\w.:-]+", host) or parts.netloc != text or "@" in text:
         raise SelectionError(f"{text!r} is not an address such as 127.0.0.1:8080 or 0.0.0.0:8080")
     return Address(host, port, "" if _is_loopback(host) else secrets.token_urlsafe(18))
+
+
+def _own_number(every: str) -> str:
+    """Return this machine's number in its network: a phone seldom knows its name.
+
+    :param every: stands for all interfaces, 0.0.0.0 or ::.
+    """
+    kind, far = (socket.AF_INET6, "2001:db8::1") if ":" in every else (socket.AF_INET, "192.0.2.1")
+    with socket.socket(kind, socket.SOCK_DGRAM) as probe:
+        try:
+            # Nothing is sent: the system only chooses the interface.
+            probe.connect((far, 9))
+        except OSError:
+            return socket.gethostname()
+        return str(probe.getsockname()[0])
 
 
 def _is_loopback(host: str) -> bool:

@@ -140,12 +140,12 @@ def of_present(subject: PageModel) -> dict[str, Any]:
     """Return the present gains, and what they do on the model.
 
     :param subject: the model.
-    :return: rows of names, values and meanings, and the responses to both steps, if there are any.
+    :return: rows of names and values, and the responses to both steps, if there are any.
     """
     case, before = subject.case, subject.before()
     if case.present is None or case.model is None:
         return {"rows": [], "steps": None}
-    rows = compared_numbers(case.present, performance_of(case.present, case))
+    rows = [row[:2] for row in compared_numbers(case.present, performance_of(case.present, case))]
     steps = None
     if before is not None:
         steps = [short(each) for each in (before.time, before.measurement, before.command)]

@@ -289,6 +289,16 @@ def test_every_other_address_gets_a_token_of_its_own():
     assert f"?token={first.token}" in first.url(8080)
 
 
+def test_the_address_of_all_interfaces_is_told_as_another_machine_reaches_it(subject):
+    address = address_of("0.0.0.0")
+    with served([subject], address) as url:
+        base = url.partition("?")[0]
+        port = base.rsplit(":")[-1].strip("/")
+        assert get(base, Cookie=f"relay_autotune_{port}={address.token}")[0] == 200
+        assert get(base)[0] == 403
+        assert socket.inet_aton(base.split("/")[2].partition(":")[0]) != bytes(4)
+
+
 @pytest.mark.parametrize("text", ["", ":80", "a b", "host:port", "1.2.3.4:99999", "x/y", "a@b"])
 def test_what_is_no_address_is_refused(text):
     with pytest.raises(SelectionError, match="not an address"):

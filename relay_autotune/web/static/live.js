@@ -297,6 +297,8 @@ export class Live {
       lines: [...lines, ...bounds.map((y) => ({ y, kind: "bound" }))],
       names: [["bound", bounds.length ? "limits of the tune" : ""], ["setpoint", lines.length ? "set-point, with the relay's band" : ""]],
     });
+    // Before the first command there is nothing to see.
+    $("plot-live-command").hidden = !command.count && !levels.length;
     this.plots.command.draw({
       xs, ys: reach(within(command, xs), [], held === null ? levels : [...levels, held]), said: said(command, "u"),
       curves: [{ ...command.curve, kind: "input", name: "command" }],
@@ -335,7 +337,7 @@ export class Live {
     $("live-result").textContent = told.result.join("\n");
     document.body.dataset.phase = told.phase;
     const runs = Boolean(told.controller);
-    $("force").hidden = !(runs || told.proves);
+    $("force").hidden = tuning || !(runs || told.proves);
     $("force-title").textContent = runs ? "The running controller" : "Prove the gains";
     for (const id of ["apply", "apply-only", "verify", "revert"]) $(id).hidden = !runs;
     $("prove").hidden = runs;

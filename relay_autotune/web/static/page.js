@@ -161,7 +161,7 @@ function gainsWords(s, between = ", ") {
 function showBeside() {
   const { rows } = subjects[chosen].present;
   $("beside-box").hidden = !(rows.length && shaped);
-  if (shaped) table($("beside"), rows.map(([name, now, meaning], k) => [name, now, shaped.beside[k], meaning]), ["", "", "", "text"]);
+  if (shaped) table($("beside"), rows.map(([name, now], k) => [name, now, shaped.beside[k]]), []);
   if (shaped) showSteps(shaped.steps);
   if (live) live.showForce();
 }
@@ -177,7 +177,7 @@ function showSteps(t) {
     xs: [0, end],
     ys: [Math.max(-1, Math.min(-0.1, ...t.measurement)), Math.min(2.5, Math.max(1.6, 1.1 * highest))],
     bands: [{ x: t.time, low: t.low, high: t.high, kind: "", name: "95 % of the models" }].filter((b) => b.low.length),
-    curves: [...before(1), { x: t.time, y: t.measurement, kind: "model", name: "the model" }],
+    curves: [...before(1), { x: t.time, y: t.measurement, kind: "model", name: "these gains" }],
     lines: [...load, { y: 1, kind: "setpoint" }],
     said: `highest ${highest.toFixed(2)} after a set-point step of 1 y, then a load step of ${t.load} u`,
   });
