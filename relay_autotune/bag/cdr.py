@@ -34,7 +34,7 @@ from relay_autotune.bag.field_path import (
     written,
 )
 from relay_autotune.bag.limits import MOST_ELEMENTS, MOST_STEPS
-from relay_autotune.bag.mcap_records import Channel, Content, every_byte
+from relay_autotune.bag.mcap_records import Channel, Content, every_byte, values_at
 from relay_autotune.errors import BagError, FieldError, visible
 
 _ENCAPSULATION = 4
@@ -72,7 +72,7 @@ class Path:
         fits = end - begin >= _ENCAPSULATION
         all_fit = bool(fits.all())
         # A message shorter than that may lie at the very end.
-        kinds = every_byte(content, "<u2")[begin if all_fit else np.where(fits, begin, 0)]
+        kinds = values_at(content, "<u2", begin if all_fit else np.where(fits, begin, 0))
         little = kinds == 0x0100
         if all_fit and bool(little.all()):
             return self._of_one_order(content, begin, end, "<")
@@ -262,7 +262,7 @@ class _Cursor:
             self.good &= fits
             at = np.where(self.good, at, 0)
         self._place = after
-        return every_byte(self._content, self._order + kind.form)[at]
+        return values_at(self._content, self._order + kind.form, at)
 
     def _align(self, size: int) -> None:
         if size > 1:

@@ -430,6 +430,29 @@ def test_an_index_of_another_channel_hides_nothing(tmp_path):
     assert any("has a bad message index" in note for note in notes)
 
 
+def test_a_message_that_is_listed_twice_hides_no_other(tmp_path):
+    path = tmp_path / "bag.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+        ids = [writer.register_channel(name, "cdr", schema) for name in ("/x", "/other")]
+        # The first chunk has the declarations, too, and is too large to be joined to the next one.
+        writer.add_message(ids[0], START, encode_float64(0.0) + bytes(1 << 20), START)
+        writer.flush()
+        for channel in ids:
+            writer.add_message(channel, START, encode_float64(1.0), START)
+        writer.finish()
+    data = bytearray(path.read_bytes())
+    # What lists the message of /x now lists that of the other, which has as many bytes.
+    *_, of_x, of_other = records(data, 7)
+    data[of_x : of_x + 31] = data[of_other : of_other + 31]
+    path.write_bytes(data)
+    values, notes = read(path)
+    assert values.tolist() == [0.0, 1.0]
+    assert any("has a bad message index" in note for note in notes)
+
+
 def test_statistics_that_differ_are_said(tmp_path):
     path = write(tmp_path / "bag.mcap", enable_crcs=False)
     data = bytearray(path.read_bytes())
