@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor
 from scipy.linalg.lapack import dpotrs
-from scipy.optimize import minimize_scalar
 from scipy.sparse import csr_array
 from scipy.special import stdtrit
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
+from relay_autotune.minimum import minimum_near
 from relay_autotune.record.cycles import find_cycles, limit_cycle, settings_of
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings, cached_on_record
 
@@ -107,14 +107,7 @@ class Spline:
         :param places: increasing phases, shape (m,).
         """
         i = int(np.argmin(np.abs(places - near)))
-        bounds = (float(places[max(i - 1, 0)]), float(places[min(i + 1, places.size - 1)]))
-        found = minimize_scalar(
-            lambda p: self._kinked(p)[0],
-            bounds=bounds,
-            method="bounded",
-            options={"xatol": _TOLERANCE},
-        )
-        return float(found.x)
+        return minimum_near(lambda p: self._kinked(p)[0], places, i, _TOLERANCE)[0]
 
 
 @dataclass(frozen=True)

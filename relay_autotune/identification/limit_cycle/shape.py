@@ -19,12 +19,13 @@ from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import brentq
 from scipy.special import fdtrc
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.limit_cycle.fold import Fold, Reading, fold
+from relay_autotune.minimum import minimum_near
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.record.cycles import cycles_of, limit_cycle, settings_of
 from relay_autotune.record.record import Record, cached_on_record
@@ -111,16 +112,15 @@ def growth_time(peaks: Envelope, noise_std: float = 0.0) -> float:
     ends = math.log(_QUICKEST * half), math.log(max(float(time[-1]), half))
     trials = np.linspace(*ends, _TRIALS)
     i = int(np.argmin([fit(x) for x in trials]))
-    bounds = (float(trials[max(i - 1, 0)]), float(trials[min(i + 1, _TRIALS - 1)]))
-    found = minimize_scalar(fit, bounds=bounds, method="bounded", options={"xatol": 1e-9})
-    steady, growing = cost(fixed), fit(float(found.x))
+    found, growing = minimum_near(fit, trials, i, 1e-9)
+    steady = cost(fixed)
     level = float(np.mean(np.abs(height)))
     least = (n - 4) * max(0.5 * noise_std, _NEGLIGIBLE * level) ** 2
     # The drop of the cost over the cost left, for 2 more parameters, is distributed as F.
     statistic = 0.5 * (steady - growing) * (n - 4) / max(growing, least, 1e-300)
     if fdtrc(2, n - 4, max(statistic, 0.0)) > _CHANCE:
         return 0.0
-    return math.exp(float(found.x))
+    return math.exp(found)
 
 
 def normalised_growth(multiplier: float) -> float:

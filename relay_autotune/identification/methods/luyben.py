@@ -25,7 +25,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import brentq
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
@@ -33,6 +33,7 @@ from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.limit_cycle.fold import Reading
 from relay_autotune.identification.methods.solved import solved, structure_asked_for
 from relay_autotune.identification.result import FitReport, Identification
+from relay_autotune.minimum import minimum_near
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import INTEGRATOR_INVERSE
 from relay_autotune.record.record import PiecewiseConstant, Record
@@ -341,11 +342,9 @@ def _fitted(test: StepTest, until: float, known: float) -> tuple[StepCurve, Floa
 def _refined(left: Callable[[float], float], near: float, places: FloatArray) -> float:
     """Return the dead time of the least sum of squares, between the two places about one."""
     i = int(np.argmin(np.abs(places - near)))
-    bounds = (float(places[max(i - 1, 0)]), float(places[min(i + 1, places.size - 1)]))
-    options = {"xatol": 1e-9 * float(places[-1])}
-    found = minimize_scalar(left, bounds=bounds, method="bounded", options=options)
+    found, least = minimum_near(left, places, i, 1e-9 * float(places[-1]))
     # The search does not try its ends.
-    return 0.0 if i <= 1 and left(0.0) <= found.fun else float(found.x)
+    return 0.0 if i <= 1 and left(0.0) <= least else found
 
 
 def _columns(since: FloatArray, dead_time: float, span: float, powers: int) -> FloatArray:

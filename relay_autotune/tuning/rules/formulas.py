@@ -33,11 +33,12 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import brentq
 
 from relay_autotune.errors import ModelError, TuningError
 from relay_autotune.identification.limit_cycle.shape import shape_of_half_cycle
 from relay_autotune.loop.gains import Controller
+from relay_autotune.minimum import minimum_near
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
@@ -485,9 +486,8 @@ def _choose(
     grid = np.log(late * _LAMBDAS)
     peaks = [peak(float(x)) for x in grid]
     top = int(np.argmin(peaks))
-    bounds = (float(grid[max(top - 1, 0)]), float(grid[min(top + 1, grid.size - 1)]))
-    best = minimize_scalar(peak, bounds=bounds, method="bounded", options={"xatol": 1e-5})
-    least, at = min((float(best.fun), float(best.x)), (peaks[top], float(grid[top])))
+    at, least = minimum_near(peak, grid, top, 1e-5)
+    least, at = min((least, at), (peaks[top], float(grid[top])))
     bound = task.options.ms if least <= task.options.ms else RELAXED * least
     before = [float(x) for x, p in zip(grid, peaks, strict=True) if x < at and p > bound]
     if not before or least >= _UNSTABLE:

@@ -34,11 +34,12 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import brentq
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller, SeriesForm
+from relay_autotune.minimum import minimum_near
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning.rules.formulas import named, process_of, wants_pid
@@ -60,12 +61,6 @@ class ResonantGain:
     lower: float
 
 
-@dataclass(frozen=True)
-class _Forbidden:
-    low: float
-    high: float
-
-
 def resonant_gain(loop: TransferFunction, decibels: float) -> ResonantGain:
     """Return the factors on a loop that give its closed loop a resonance.
 
@@ -84,19 +79,38 @@ def resonant_gain(loop: TransferFunction, decibels: float) -> ResonantGain:
     square = 10.0 ** (decibels / 10.0)
     w = _grid(loop, limit.frequency)
     low, high = _roots(loop, w, square)
-    intervals = _intervals(loop, w, low, high, square)
-    # Sorted from above, so that one pass joins all that overlap with the ultimate gain.
-    joined = _Forbidden(limit.gain, limit.gain)
-    for each in sorted(intervals, key=lambda i: -i.high):
-        if each.low <= joined.high and each.high >= joined.low * (1.0 - 1e-12):
-            joined = _Forbidden(min(joined.low, each.low), max(joined.high, each.high))
-    if joined.low <= 0.0:
+    inside = np.flatnonzero(~np.isnan(low))
+    # Neighbouring frequencies forbid one interval of gains; the highest one comes first, so that
+    # one pass joins all that overlap with the ultimate gain.
+    runs = np.split(inside, np.flatnonzero(np.diff(inside) > 1) + 1) if inside.size else []
+    runs.sort(key=lambda run: -float(high[run].max()))
+    upper, at = limit.gain, -1
+    for run in runs:
+        i = int(run[np.argmin(low[run])])
+        if low[i] < upper <= high[run].max() * (1.0 + 1e-12):
+            upper, at = float(low[i]), i
+    if at == 0:
+        # At the lowest frequency of a double integrator the interval goes on down to zero.
         raise TuningError(
             f"no gain gives this loop a resonance as small as {decibels:g} dB: its integral time "
             "is too short, or its derivative time unsuitable"
         )
-    below = [i.high for i in intervals if i.high < joined.low]
-    return ResonantGain(joined.low, max(below, default=0.0))
+
+    def refined(i: int, which: int, side: float) -> float:
+        """Return the least lower end (side 1) or the largest upper end (-1) near a frequency."""
+        ends = (low, high)[which]
+
+        def end(log_w: float) -> float:
+            value = float(_roots(loop, np.array([math.exp(log_w)]), square)[which][0])
+            return 1e3 * ends[i] * max(side, 0.0) if math.isnan(value) else side * value
+
+        return side * min(minimum_near(end, np.log(w), i, 1e-12)[1], side * ends[i])
+
+    lower = next((run for run in runs if high[run].max() < upper), None)
+    return ResonantGain(
+        upper if at < 0 else refined(at, 0, 1.0),
+        0.0 if lower is None else refined(int(lower[np.argmax(high[lower])]), 1, -1.0),
+    )
 
 
 def _grid(loop: TransferFunction, limit: float) -> FloatArray:
@@ -120,39 +134,6 @@ def _roots(loop: TransferFunction, w: FloatArray, square: float) -> tuple[FloatA
     high = (-square * real + root) / ((square - 1.0) * size)
     low = square / ((square - 1.0) * size * high)
     return low, high
-
-
-def _intervals(
-    loop: TransferFunction, w: FloatArray, low: FloatArray, high: FloatArray, square: float
-) -> list[_Forbidden]:
-    inside = np.flatnonzero(~np.isnan(low))
-    found = []
-    for run in np.split(inside, np.flatnonzero(np.diff(inside) > 1) + 1):
-        if run.size == 0:
-            continue
-        first, last = max(int(run[0]) - 1, 0), min(int(run[-1]) + 1, w.size - 1)
-        i, j = run[int(np.argmin(low[run]))], run[int(np.argmax(high[run]))]
-        lowest = _refined(loop, w, int(i), square, 0, first, last)
-        highest = _refined(loop, w, int(j), square, 1, first, last)
-        # At the lowest frequency of a double integrator the interval goes on down to zero.
-        found.append(_Forbidden(0.0 if i == 0 else min(lowest, low[i]), max(highest, high[j])))
-    return found
-
-
-def _refined(
-    loop: TransferFunction, w: FloatArray, i: int, square: float, which: int, first: int, last: int
-) -> float:
-    sign = 1.0 if which == 0 else -1.0
-    at = float(_roots(loop, w[i : i + 1], square)[which][0])
-    beyond = 1e3 * at if which == 0 else 0.0
-
-    def objective(log_w: float) -> float:
-        value = float(_roots(loop, np.array([math.exp(log_w)]), square)[which][0])
-        return beyond if math.isnan(value) else sign * value
-
-    bounds = (math.log(w[max(i - 1, first)]), math.log(w[min(i + 1, last)]))
-    found = minimize_scalar(objective, bounds=bounds, method="bounded", options={"xatol": 1e-12})
-    return sign * float(found.fun)
 
 
 SHARES = (0.5, 0.25)
@@ -300,11 +281,7 @@ def derivative(
             f"with {100.0 * share:.0f} % of the PI controller's integral time no derivative time "
             f"has a gain of +{decibels:g} dB"
         )
-    bounds = (float(tried[max(top - 1, 0)]), float(tried[min(top + 1, tried.size - 1)]))
-    best = minimize_scalar(
-        lambda td: -size(td), bounds=bounds, method="bounded", options={"xatol": 1e-6 * short}
-    )
-    td = float(best.x)
+    td, _ = minimum_near(lambda td: -size(td), tried, top, 1e-6 * short)
     return Derivative(share, SeriesForm(model.process_sign * size(td), short, td, alpha))
 
 
@@ -342,11 +319,7 @@ def _peak(model: TransferFunction, scale: float, ti: float) -> float:
     grid = _GRID / scale
     values = model.phase(grid) - 0.5 * math.pi + np.arctan(grid * ti)
     top = int(np.argmax(values))
-    low, high = grid[max(top - 1, 0)], grid[min(top + 1, grid.size - 1)]
-    best = minimize_scalar(
-        lambda log_w: -phase(math.exp(log_w)),
-        bounds=(math.log(low), math.log(high)),
-        method="bounded",
-        options={"xatol": 1e-10},
+    _, lowest = minimum_near(
+        lambda log_w: -phase(math.exp(log_w)), np.log(grid), top, tolerance=1e-10
     )
-    return max(float(values[top]), -float(best.fun))
+    return max(float(values[top]), -lowest)
