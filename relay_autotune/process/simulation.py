@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -176,27 +176,42 @@ def _root(function: Callable[[float], float], low: float, high: float) -> float:
     return float(brentq(function, low, high, xtol=1e-16 * high, rtol=1e-15, maxiter=1000))
 
 
-class _Segment:
-    """The motion between two changes of the delayed input."""
+class _Piece:
+    """The motion between two changes of the delayed input, or up to a switch.
+
+    :param modes: of the process.
+    :param rates: the same, of the rate of its output.
+    :param z: their states at the beginning.
+    :param level: measurement at rest [y].
+    :param corners: the shortest time constant [s], and the fastest oscillation [rad/s].
+    :param begin: when it begins [s].
+    """
 
     def __init__(
-        self, modes: Modes, rates: Modes, z: Coordinates, level: float, corners: FloatArray
+        self,
+        modes: Modes,
+        rates: Modes,
+        z: Coordinates,
+        level: float,
+        corners: tuple[float, float],
+        begin: float,
     ) -> None:
-        self.modes, self.rates, self.level, self._corners = modes, rates, level, corners
-        self.states = modes.split(z)
+        self.begin, self.length = begin, 0.0
+        self._modes, self._rates, self._states = modes, rates, modes.split(z)
+        self._level, self._corners = level, corners
         # A smaller difference from a threshold is rounding.
-        size = modes.size_of(self.states)
-        self.rounding = 8.0 * np.finfo(float).eps * (abs(level) + size)
+        size = modes.size_of(self._states)
+        self._rounding = 8.0 * np.finfo(float).eps * (abs(level) + size)
 
     def output(self, time: ArrayLike) -> FloatArray:
         at = np.atleast_1d(np.asarray(time, dtype=np.float64))
-        return np.asarray(self.level + self.modes.outputs(self.states, at)[0])
+        return np.asarray(self._level + self._modes.outputs(self._states, at)[0])
 
-    def slope(self, time: float) -> float:
-        return float(self.rates.outputs(self.states, np.array([time]))[0, 0])
+    def _slope(self, time: float) -> float:
+        return float(self._rates.outputs(self._states, np.array([time]))[0, 0])
 
-    def grid(self, length: float) -> FloatArray:
-        """Return times dense enough that each cell holds at most one extremum."""
+    def instants(self, length: float) -> FloatArray:
+        """Return times up to a length, between which the output only rises or only falls."""
         fastest, oscillation = self._corners
         parts = [np.linspace(0.0, length, 33)]
         if 1e-3 * fastest < length:
@@ -204,63 +219,23 @@ class _Segment:
             parts.append(np.geomspace(1e-3 * fastest, length, count))
         if oscillation > 0.0:
             parts.append(np.linspace(0.0, length, min(int(length * oscillation * 4) + 2, 100_000)))
-        return np.unique(np.concatenate(parts))
-
-    def turning_points(self, grid: FloatArray) -> FloatArray:
-        """Return the times of the extrema between the grid's ends."""
-        slope = self.rates.outputs(self.states, grid)[0]
+        # Each cell holds at most one extremum.
+        grid = np.unique(np.concatenate(parts))
+        slope = self._rates.outputs(self._states, grid)[0]
         cells = np.flatnonzero(slope[:-1] * slope[1:] < 0.0)
-        return np.array([_root(self.slope, grid[i], grid[i + 1]) for i in cells])
+        return np.unique(np.append(grid, [_root(self._slope, *grid[i : i + 2]) for i in cells]))
 
-    def first_rise(self, excess: Callable[[FloatArray], FloatArray], grid: FloatArray) -> float:
+    def first_rise(self, excess: Callable[[FloatArray], FloatArray], length: float) -> float:
         """First time at which ``excess(y)`` passes zero upwards; nan if it does not."""
-        grid = np.unique(np.concatenate((grid, self.turning_points(grid))))
-        f = excess(self.output(grid))
-        cells = np.flatnonzero((f[:-1] <= self.rounding) & (f[1:] > self.rounding))
+        at = self.instants(length)
+        f = excess(self.output(at))
+        cells = np.flatnonzero((f[:-1] <= self._rounding) & (f[1:] > self._rounding))
         if cells.size == 0:
             return math.nan
         i = int(cells[0])
-        if f[i] >= -self.rounding:
-            return float(grid[i])
-
-        def crossing(time: float) -> float:
-            return float(excess(self.output(time))[0])
-
-        return _root(crossing, grid[i], grid[i + 1])
-
-
-@dataclass
-class _Half:
-    """Data collected between two switches."""
-
-    start: float
-    level_is_high: bool
-    end: float = 0.0
-    peak_max: float = -math.inf
-    peak_min: float = math.inf
-    when_max: float = 0.0
-    when_min: float = 0.0
-    area: float = 0.0
-    # Each piece of the motion with its length and its begin.
-    pieces: list[tuple[_Segment, float, float]] = field(default_factory=list)
-
-    def measure(self) -> None:
-        """Find the peaks and the area."""
-        for segment, length, begin in self.pieces:
-            self._add(segment, segment.grid(length), begin)
-
-    def _add(self, segment: _Segment, grid: FloatArray, begin: float) -> None:
-        at = np.unique(np.concatenate((grid, segment.turning_points(grid))))
-        y = segment.output(at)
-        if y.max() > self.peak_max:
-            self.peak_max, self.when_max = float(y.max()), begin + float(at[np.argmax(y)])
-        if y.min() < self.peak_min:
-            self.peak_min, self.when_min = float(y.min()), begin + float(at[np.argmin(y)])
-        nodes, weights = _QUADRATURE
-        half = np.diff(at)[:, None] / 2.0
-        inner = at[:-1, None] + half * (nodes + 1.0)
-        values = segment.output(inner.ravel()).reshape(inner.shape)
-        self.area += float(np.sum(values * weights * half))
+        if f[i] >= -self._rounding:
+            return float(at[i])
+        return _root(lambda time: float(excess(self.output(time))[0]), *at[i : i + 2])
 
 
 def simulate_relay(
@@ -293,42 +268,40 @@ def simulate_relay(
     :param most_switches: more switches than this count as chatter.
     :raises ModelError: if the measurement never reaches a switching level, or the relay chatters.
     """
-    process = replace(model, dead_time=model.dead_time + settings.extra_delay)
-    modes = Modes.of(process)
+    dead_time = model.dead_time + settings.extra_delay
+    modes = Modes.of(model)
     rates = modes.rates
-    constants = [abs(t) for t in model.time_constants] or [max(process.dead_time, 1e-9)]
+    constants = [abs(t) for t in model.time_constants] or [max(dead_time, 1e-9)]
     oscillation = max((abs((1.0 / t).imag) for t in model.time_constants), default=0.0)
-    corners = np.array([min(constants), oscillation])
+    corners = (min(constants), oscillation)
     level = settings.setpoint if operating_point is None else operating_point
-    slowest = max(*constants, process.dead_time, 1e-12)
     samples = np.asarray(time, dtype=np.float64)
     measured = np.full(samples.shape, math.nan)
 
     z, now, arrived = modes.rest(), 0.0, settings.baseline
-    direct = not settings.reverse_acting
-    is_high = direct
+    # The first level moves the measurement up, to its first threshold.
+    rising, is_high = True, not settings.reverse_acting
     threshold = settings.setpoint + (settings.hysteresis if kick is None else kick)
-    if threshold == level and process.dead_time == 0.0:
+    if threshold == level and dead_time == 0.0:
         # Which way the first switch goes would be rounding.
-        raise ModelError(
-            "the relay switches twice at t = 0 s: without dead time and hysteresis it needs a "
-            "kick to leave the set-point"
-        )
+        raise _no_delay(0.0)
     switches = [(0.0, settings.high if is_high else settings.low)]
-    on_the_way = deque([(process.dead_time, switches[0][1])])
-    half = _Half(0.0, is_high)
-    halves: list[_Half] = []
-    segment = _Segment(modes, rates, z, level, corners)
+    on_the_way = deque([(dead_time, switches[0][1])])
+    pieces: list[_Piece] = []
     # The half cycle from rest and the one after it come before the first whole cycle.
-    while sum(1 for h in halves[1:] if h.level_is_high != direct) <= cycles:
+    while len(switches) < 2 * cycles + 3:
+        while on_the_way and on_the_way[0][0] <= now:
+            _, value = on_the_way.popleft()
+            z = z + (value - arrived) * modes.input_direction
+            arrived = value
+        slowest = max(*constants, dead_time, 1e-12)
         length = on_the_way[0][0] - now if on_the_way else 60.0 * slowest
-        rising = is_high == direct
 
         def excess(y: FloatArray, rising: bool = rising, at: float = threshold) -> FloatArray:
             return y - at if rising else at - y
 
-        grid = segment.grid(length) if length > 0.0 else np.zeros(1)
-        crossing = segment.first_rise(excess, grid) if length > 0.0 else math.nan
+        piece = _Piece(modes, rates, z, level, corners, now)
+        crossing = piece.first_rise(excess, length)
         switching = not math.isnan(crossing)
         if not switching and not on_the_way:
             raise ModelError(
@@ -338,71 +311,72 @@ def simulate_relay(
             )
         step = crossing if switching else length
         if step > 0.0:
-            half.pieces.append((segment, step, now))
+            piece.length = step
+            pieces.append(piece)
             inside = (samples >= now) & (samples <= now + step) & np.isnan(measured)
-            measured[inside] = segment.output(samples[inside] - now)
+            measured[inside] = piece.output(samples[inside] - now)
             z, now = modes.move(z, step), now + step
         if switching:
             if now <= switches[-1][0]:
-                raise ModelError(
-                    f"the relay switches twice at t = {now:g} s: without dead time and hysteresis "
-                    "it needs a kick to leave the set-point"
-                )
-            half.end = now
-            halves.append(half)
-            is_high = not is_high
-            half = _Half(now, is_high)
-            threshold = settings.setpoint + (1 if is_high == direct else -1) * settings.hysteresis
+                raise _no_delay(now)
+            rising, is_high = not rising, not is_high
+            threshold = settings.setpoint + (1 if rising else -1) * settings.hysteresis
             switches.append((now, settings.high if is_high else settings.low))
-            on_the_way.append((now + process.dead_time, switches[-1][1]))
+            on_the_way.append((now + dead_time, switches[-1][1]))
             if len(switches) > most_switches:
                 raise ModelError(
                     f"{most_switches} switches by t = {now:g} s: the relay chatters on this "
                     "process; a dead time or a hysteresis is needed for a limit cycle"
                 )
-        while on_the_way and on_the_way[0][0] <= now:
-            _, value = on_the_way.popleft()
-            z = z + (value - arrived) * modes.input_direction
-            arrived = value
-        segment = _Segment(modes, rates, z, level, corners)
-    times, levels = np.array([s[0] for s in switches]), np.array([s[1] for s in switches])
+    times, levels = (np.array(column) for column in zip(*switches, strict=True))
     command = PiecewiseConstant(times, levels, settings.baseline)
     known = ~np.isnan(measured)
-    found = _whole_cycles(halves, settings, told)
+    first = 0 if told is None else max(cycles - told, 0)
+    found = tuple(_cycle(k, times, pieces, settings) for k in range(first, cycles))
     return RelayRun(settings, command, found, samples[known], measured[known])
 
 
-def _whole_cycles(
-    halves: list[_Half], settings: RelaySettings, told: int | None
-) -> tuple[Cycle, ...]:
-    # The first half starts from rest and belongs to no cycle.
-    usable = halves[1:] if not settings.reverse_acting else halves
-    usable = usable[next((i for i, h in enumerate(usable) if h.level_is_high), 0) :]
-    if usable and usable[0].start == 0.0:
-        usable = usable[2:]
-    cycles = []
-    whole = len(usable) // 2
-    for index in range(0 if told is None else max(whole - told, 0), whole):
-        high, low = usable[2 * index], usable[2 * index + 1]
-        high.measure()
-        low.measure()
-        # The low level turns a direct-acting process down, the high level a reverse-acting one.
-        down, up = (high, low) if settings.reverse_acting else (low, high)
-        t_high, t_low = high.end - high.start, low.end - low.start
-        period = t_high + t_low
-        cycles.append(
-            Cycle(
-                index=index,
-                start=high.start,
-                period=period,
-                period_high=t_high,
-                period_low=t_low,
-                peak_max=down.peak_max,
-                peak_min=up.peak_min,
-                time_to_peak_max=down.when_max - down.start,
-                time_to_peak_min=up.when_min - up.start,
-                mean_measurement=(high.area + low.area) / period,
-                mean_command=(settings.high * t_high + settings.low * t_low) / period,
+def _no_delay(time: float) -> ModelError:
+    return ModelError(
+        f"the relay switches twice at t = {time:g} s: without dead time and hysteresis it needs a "
+        "kick to leave the set-point"
+    )
+
+
+def _cycle(
+    index: int, switches: FloatArray, pieces: list[_Piece], settings: RelaySettings
+) -> Cycle:
+    """Return a whole cycle, whose first half begins with the switch to the high level."""
+    k = 2 * index + (1 if settings.reverse_acting else 2)
+    begins = np.array([piece.begin for piece in pieces])
+    halves, area = [], 0.0
+    nodes, weights = _QUADRATURE
+    for half in range(2):
+        own = slice(*np.searchsorted(begins, switches[k + half : k + half + 2]))
+        times, values = [], []
+        for piece in pieces[own]:
+            at = piece.instants(piece.length)
+            times.append(piece.begin + at - switches[k + half])
+            values.append(piece.output(at))
+            cell = 0.5 * np.diff(at)[:, None]
+            inner = at[:-1, None] + cell * (nodes + 1.0)
+            area += float(
+                np.sum(piece.output(inner.ravel()).reshape(inner.shape) * weights * cell)
             )
-        )
-    return tuple(cycles)
+        halves.append((np.concatenate(times), np.concatenate(values)))
+    # The low level turns a direct-acting process down, the high level a reverse-acting one.
+    (late, down), (early, up) = halves if settings.reverse_acting else halves[::-1]
+    t_high, t_low = (float(t) for t in np.diff(switches[k : k + 3]))
+    return Cycle(
+        index=index,
+        start=float(switches[k]),
+        period=t_high + t_low,
+        period_high=t_high,
+        period_low=t_low,
+        peak_max=float(down.max()),
+        peak_min=float(up.min()),
+        time_to_peak_max=float(late[np.argmax(down)]),
+        time_to_peak_min=float(early[np.argmin(up)]),
+        mean_measurement=area / (t_high + t_low),
+        mean_command=(settings.high * t_high + settings.low * t_low) / (t_high + t_low),
+    )
