@@ -15,11 +15,12 @@ The spline is fitted by least squares and may have a kink.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor
 from scipy.linalg.lapack import dpotrs
@@ -30,7 +31,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.minimum import minimum_near
 from relay_autotune.record.cycles import find_cycles, limit_cycle, settings_of
-from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings, cached_on_record
+from relay_autotune.record.record import Record, RelaySettings, cached_on_record
 
 _RIDGE = 1e-13
 _TOLERANCE = 1e-7
@@ -110,6 +111,22 @@ class Spline:
         return minimum_near(lambda p: self._kinked(p)[0], places, i, _TOLERANCE)[0]
 
 
+def _with_slopes(*rows: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    """Return coefficients of polynomials and of their derivatives, a column for each."""
+    coefficients = np.array(rows).T
+    return coefficients, np.asarray(polyder(coefficients))
+
+
+# The four pieces of a cubic B-spline, and functions with a jump of the first and of the second
+# derivative at the ends of their unit.
+_PIECES = _with_slopes(
+    *((1 / 6, -0.5, 0.5, -1 / 6), (2 / 3, 0.0, -1.0, 0.5), (1 / 6, 0.5, 0.5, -0.5)),
+    (0.0, 0.0, 0.0, 1 / 6),
+)
+_WAVES = _with_slopes((1.0, -2.0, 0.0), (0.0, 1.0, -1.0))
+_BERNOULLI = _with_slopes((0.0, 1.0, -1.0, 0.0), (0.0, 1.0, -3.0, 2.0))
+
+
 @dataclass(frozen=True)
 class Basis:
     """Functions that repeat with period 1, or mirrored: that change their sign after 1.
@@ -132,21 +149,7 @@ class Basis:
         place = (phase - turn) * knots
         cell = np.minimum(np.floor(place).astype(np.int64), knots - 1)
         s = place - cell
-        pieces = (
-            (
-                (1.0 - s) ** 3 / 6.0,
-                (3.0 * s**3 - 6.0 * s**2 + 4.0) / 6.0,
-                (-3.0 * s**3 + 3.0 * s**2 + 3.0 * s + 1.0) / 6.0,
-                s**3 / 6.0,
-            )
-            if derivative == 0
-            else (
-                -0.5 * (1.0 - s) ** 2 * knots,
-                (1.5 * s**2 - 2.0 * s) * knots,
-                (-1.5 * s**2 + s + 0.5) * knots,
-                0.5 * s**2 * knots,
-            )
-        )
+        pieces = float(knots) ** derivative * polyval(s, _PIECES[derivative])
         columns = np.zeros((phase.size, knots))
         rows = np.arange(phase.size)
         for k, piece in enumerate(pieces):
@@ -164,20 +167,10 @@ class Basis:
         columns = []
         for place in (edge,) if self.mirrored else (edge, self.high + edge):
             turn = np.floor(phase - place)
-            s = phase - place - turn
-            if self.mirrored:
-                sign = np.where(turn % 2.0 == 0.0, 1.0, -1.0)
-                pair = (
-                    (1.0 - 2.0 * s, s * (1.0 - s))
-                    if derivative == 0
-                    else (np.full(s.size, -2.0), 1.0 - 2.0 * s)
-                )
-                columns += [sign * pair[0], sign * pair[1]]
-            elif derivative == 0:
-                columns += [s * (1.0 - s), s * (1.0 - s) * (1.0 - 2.0 * s)]
-            else:
-                columns += [1.0 - 2.0 * s, 1.0 - 6.0 * s + 6.0 * s**2]
-        return np.stack(columns, axis=1)
+            sign = np.where(turn % 2.0 == 1.0, -1.0, 1.0) if self.mirrored else 1.0
+            pair = (_WAVES if self.mirrored else _BERNOULLI)[derivative]
+            columns.append(sign * polyval(phase - place - turn, pair))
+        return np.concatenate(columns).T
 
 
 # Numbers of knots in half a period, from the fewest on, and least number of samples for each.
@@ -315,12 +308,20 @@ class Fold:
         return np.asarray(y / unit if derivative else y)
 
 
-def fold(record: Record, cycles: tuple[int, ...] = (), *, sharp: bool = False) -> Fold:
+def fold(
+    record: Record,
+    cycles: tuple[int, ...] = (),
+    *,
+    sharp: bool = False,
+    left_out: int | None = None,
+) -> Fold:
     """Average the steady cycles of a relay test.
 
     :param record: with at least one whole cycle.
     :param cycles: numbers of the cycles to be averaged; default: those of the limit cycle.
     :param sharp: True if there is a kink for certain, so that only its place is decided.
+    :param left_out: number of a cycle that is left out, with the knots of the average of all and
+        the kink near theirs; None: none.
     :raises IdentificationError: if the record holds no whole cycle, or too few samples in it.
     """
     if settings_of(record) is None or len(record.cycle_start or find_cycles(record)) < 2:
@@ -328,23 +329,7 @@ def fold(record: Record, cycles: tuple[int, ...] = (), *, sharp: bool = False) -
             "the shape of a limit cycle needs at least one whole cycle of a relay test and the "
             "record holds none: use the method waveform, which takes any input"
         )
-    return _averaged(record, cycles or limit_cycle(record).cycles, sharp)
-
-
-@cached_on_record
-def fold_without(
-    record: Record, cycles: tuple[int, ...], left_out: int, sharp: bool = False
-) -> Fold:
-    """Average all but one of some cycles, with the knots of the average of all.
-
-    :param record: with whole cycles.
-    :param cycles: numbers of the cycles.
-    :param left_out: number of the cycle that is left out; the kink is sought near that of all.
-    :param sharp: as for :func:`fold`.
-    :raises IdentificationError: if there are too few samples in the others.
-    """
-    rest = tuple(c for c in cycles if c != left_out)
-    return _average(record, rest, fold(record, cycles, sharp=sharp), sharp=False)
+    return _averaged(record, cycles or limit_cycle(record).cycles, sharp, left_out)
 
 
 # Least number of cycles that have a scatter; of many, not every one is left out.
@@ -384,7 +369,8 @@ class Reading:
         values, covariance = measure(fold(record, cycles, sharp=sharp)), None
         if count >= LEAST_CYCLES:
             left_out = cycles[:: -(-count // _MOST_PARTS)]
-            parts = np.array([measure(fold_without(record, cycles, c, sharp)) for c in left_out])
+            folds = [fold(record, cycles, sharp=sharp, left_out=c) for c in left_out]
+            parts = np.array([measure(each) for each in folds])
             away = parts - np.mean(parts, axis=0)
             covariance = np.asarray(away.T @ away * (count - 1) / len(parts))
         return cls(values, covariance, count)
@@ -418,15 +404,13 @@ class Reading:
 
 
 @cached_on_record
-def _averaged(record: Record, cycles: tuple[int, ...], sharp: bool) -> Fold:
-    return _average(record, cycles, None, sharp=sharp)
-
-
-def _average(record: Record, cycles: tuple[int, ...], like: Fold | None, *, sharp: bool) -> Fold:
+def _averaged(record: Record, cycles: tuple[int, ...], sharp: bool, left_out: int | None) -> Fold:
     settings = settings_of(record)
     assert settings is not None
     bounds = record.cycle_start or find_cycles(record)
-    since, is_high, y, high, low = _overlaid(record, settings, bounds, cycles)
+    chosen = tuple(c for c in cycles if c != left_out)
+    like = None if left_out is None else _averaged(record, cycles, sharp, None)
+    since, is_high, y, high, low = _overlaid(record, settings, bounds, chosen)
     mirrored = abs(settings.bias) <= NO_BIAS * settings.amplitude and abs(
         high - low
     ) <= SYMMETRIC * (high + low)
@@ -468,12 +452,11 @@ def _overlaid(
     record: Record, settings: RelaySettings, bounds: tuple[int, ...], chosen: tuple[int, ...]
 ) -> tuple[FloatArray, NDArray[np.bool_], FloatArray, float, float]:
     """Return of all samples the time since the last switch, the level and y; mean half periods."""
-    u = record.input()
     middle = settings.baseline + settings.bias
     since, is_high, y, highs, lows = [], [], [], [], []
     for index in chosen:
         first, last = bounds[index], bounds[index + 1]
-        up, down, end = _switches(record, u, first, last, middle)
+        up, down, end = _switches(record, first, last, middle)
         t = record.time[first : last + 1]
         inside = (t >= up) & (t < end)
         t = t[inside]
@@ -492,15 +475,21 @@ def _overlaid(
     )
 
 
-def _switches(
-    record: Record, u: PiecewiseConstant, first: int, last: int, middle: float
-) -> tuple[float, float, float]:
+def switched_at(record: Record, samples: Sequence[int]) -> FloatArray:
+    """Return when the command switched beside some samples [s].
+
+    :param record: with a command that switches.
+    :param samples: numbers of the samples.
+    """
+    switches = record.input().times
+    nearest = [switches[np.argmin(np.abs(switches - record.time[s]))] for s in samples]
+    return np.minimum(nearest, record.time[-1])
+
+
+def _switches(record: Record, first: int, last: int, middle: float) -> tuple[float, float, float]:
     """Return the instants at which a cycle's command went high, low, and high again."""
-    ends = []
-    for sample in (first, last):
-        nearest = int(np.argmin(np.abs(u.times - record.time[sample])))
-        ends.append(min(float(u.times[nearest]), float(record.time[-1])))
-    up, end = ends
+    u = record.input()
+    up, end = switched_at(record, (first, last)).tolist()
     inside = (u.times > up) & (u.times < end)
     edges = np.concatenate((u.times[inside], [end]))
     # Noise may make the relay switch back and forth; the longest stay at the low level counts.

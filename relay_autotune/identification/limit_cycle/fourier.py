@@ -9,13 +9,15 @@ The point of frequency zero is the static gain from the means of measurement and
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.limit_cycle.fold import LEAST_CYCLES
+from relay_autotune.identification.limit_cycle.fold import LEAST_CYCLES, switched_at
 from relay_autotune.identification.limit_cycle.limit_cycle import RelayTest
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
@@ -113,9 +115,7 @@ def cycle_ends(record: Record, first: int = 0) -> FloatArray:
             f"the record holds {max(len(record.cycle_start) - 1, 0)} whole cycles, of which "
             f"{first} are left out; at least one is needed: let the relay switch longer"
         )
-    switches = record.input().times
-    nearest = [switches[np.argmin(np.abs(switches - record.time[b]))] for b in bounds]
-    return np.minimum(nearest, record.time[-1])
+    return switched_at(record, bounds)
 
 
 def frequency_point(record: Record, harmonic: int = 1, first: int = 0) -> FrequencyPoint:
@@ -287,22 +287,15 @@ def measured_points(test: RelayTest) -> Points:
     part = record.noise * interval * math.sqrt(0.5 * (last - first))
     found = []
     for harmonic in range(1, int(_COARSEST / (fundamental * interval)) + 1)[:_MOST]:
-        try:
-            point = frequency_point(record, harmonic)
-        except IdentificationError:
-            # The command of a symmetric relay holds nothing at the even ones.
-            continue
-        point = replace(point, std=_deviation(point, interval, part / abs(_excited(test, point))))
-        if not point.std > _TOO_UNCERTAIN * abs(point.value):
-            found.append(point)
-        elif harmonic == 1:
-            raise _drowned(point)
+        # The command of a symmetric relay holds nothing at the even ones.
+        with suppress(IdentificationError):
+            found.append(frequency_point(record, harmonic))
     if not found:
         raise IdentificationError(
             "the command holds nothing at the frequency of its cycles: they are not bounded by "
             "the switches of a relay"
         )
-    return tuple(found)
+    return _certain(test, found, [part] * len(found))
 
 
 def with_noise_about(model: TransferFunction, test: RelayTest, points: Points) -> Points:
@@ -323,14 +316,13 @@ def with_noise_about(model: TransferFunction, test: RelayTest, points: Points) -
     start, end, cycles = float(ends[0]), float(ends[-1]), ends.size - 1
     if cycles < 2:
         return points
-    interval = record.interval
     inside = slice(record.cycle_start[0], record.cycle_start[-1] + 1)
     time = record.time[inside]
     left = record.measurement[inside] - response(model, time, record.input())
     left = left - np.polyval(np.polyfit(time - time[0], left, 1), time - time[0])
     step = 2.0 * math.pi / (end - start)
     begin, until = max(start, float(time[0])), min(end, float(time[-1]))
-    found = []
+    parts = []
     for point in points:
         number = round(point.frequency / step)
         powers = [
@@ -338,29 +330,31 @@ def with_noise_about(model: TransferFunction, test: RelayTest, points: Points) -
             for each in range(number - _NEIGHBOURS, number + _NEIGHBOURS + 1)
             if each % cycles and each > 0
         ]
-        part = math.sqrt(0.5 * float(np.mean(powers)))
-        deviation = _deviation(point, interval, part / abs(_excited(test, point)))
-        if not deviation > _TOO_UNCERTAIN * abs(point.value):
-            found.append(replace(point, std=deviation))
-    if not found or found[0].frequency > points[0].frequency:
-        raise _drowned(points[0])
+        parts.append(math.sqrt(0.5 * float(np.mean(powers))))
+    return _certain(test, points, parts)
+
+
+def _certain(test: RelayTest, points: Sequence[FrequencyPoint], parts: Sequence[float]) -> Points:
+    """Return points with their standard deviations, without those that are too uncertain.
+
+    :param test: that they were measured in.
+    :param points: the lowest first.
+    :param parts: standard deviations of the parts of the measurement's integrals [y s].
+    :raises IdentificationError: if the lowest one is too uncertain.
+    """
+    ends, u = cycle_ends(test.record), test.record.input()
+    found = []
+    for point, part in zip(points, parts, strict=True):
+        w, size = point.frequency, abs(point.value)
+        noise = part / abs(fourier_integral_held(u, float(ends[0]), float(ends[-1]), w))
+        chord = _POLYGON * (w * test.record.interval) ** 2 * size
+        std = math.hypot(noise, chord)
+        if not std > _TOO_UNCERTAIN * size:
+            found.append(replace(point, std=std))
+        elif point is points[0]:
+            raise IdentificationError(
+                f"the response at {w:.4g} rad/s, the frequency of the limit cycle, is uncertain "
+                f"by more than {100.0 * _TOO_UNCERTAIN:.0f} %: raise the amplitude of the relay, "
+                "or let it run for more cycles"
+            )
     return tuple(found)
-
-
-def _drowned(point: FrequencyPoint) -> IdentificationError:
-    return IdentificationError(
-        f"the response at {point.frequency:.4g} rad/s, the frequency of the limit cycle, is "
-        f"uncertain by more than {100.0 * _TOO_UNCERTAIN:.0f} %: raise the amplitude of the "
-        "relay, or let it run for more cycles"
-    )
-
-
-def _excited(test: RelayTest, point: FrequencyPoint) -> complex:
-    ends = cycle_ends(test.record)
-    u = test.record.input()
-    return fourier_integral_held(u, float(ends[0]), float(ends[-1]), point.frequency)
-
-
-def _deviation(point: FrequencyPoint, interval: float, noise: float) -> float:
-    chord = _POLYGON * (point.frequency * interval) ** 2 * abs(point.value)
-    return math.hypot(noise, chord)

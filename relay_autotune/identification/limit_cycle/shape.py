@@ -210,27 +210,20 @@ class Shape:
 
     @property
     def category(self) -> str:
-        """One of "1a", "1b", "2", "3"."""
-        return category(self)
+        """One of "1a", "1b", "2", "3"; a growth of NaN counts as steady at once.
 
-
-def category(shape: Shape) -> str:
-    """Return the category of a shape: "1a", "1b", "2" or "3".
-
-    1. q < 0.25: 1a. A FOPDT process has 0.178 to 0.200 whatever its D/tau, a smooth peak at least
-       0.370. Where t_p < P/4 only an unstable FOPDT fits, whose q grows with D/tau; the limit
-       then grows in proportion.
-    2. else tau_G/P > 1: 2.
-    3. else plateau > 0.42: 1b.
-    4. else 3.
-
-    :param shape: with ``growth``; NaN counts as steady at once.
-    """
-    if shape.sharpness < SHARP * _widened(shape):
-        return "1a"
-    if shape.growth > SLOW:
-        return "2"
-    return "1b" if shape.plateau > FLAT else "3"
+        1. q < 0.25: 1a. A FOPDT process has 0.178 to 0.200 whatever its D/tau, a smooth peak at
+           least 0.370. Where t_p < P/4 only an unstable FOPDT fits, whose q grows with D/tau; the
+           limit then grows in proportion.
+        2. else tau_G/P > 1: 2.
+        3. else plateau > 0.42: 1b.
+        4. else 3.
+        """
+        if self.sharpness < SHARP * _widened(self):
+            return "1a"
+        if self.growth > SLOW:
+            return "2"
+        return "1b" if self.plateau > FLAT else "3"
 
 
 def _widened(shape: Shape) -> float:
@@ -350,38 +343,33 @@ VARYING = ("half_period", "amplitude", "level", "time_to_peak", "rise", "rise_ha
 
 
 @cached_on_record
-def shape_of_record(record: Record) -> Shape:
+def shape_of_record(record: Record, *, sharp: bool = False) -> Shape:
     """Return the shape of a relay test, the mean of its two halves.
 
     :param record: with at least one whole cycle.
+    :param sharp: True if the peaks are known to be sharp, however much noise there is.
     :raises IdentificationError: if the record holds no whole cycle, or none about its set-point.
     """
-    whole = fold(record)
-    return shape_of_fold(whole, _growth(record, whole.period))
+    whole = fold(record, sharp=sharp)
+    noise = 0.0 if math.isnan(record.noise_std) else record.noise_std
+    return shape_of_fold(whole, growth_time(envelope(record), noise) / whole.period)
 
 
 def read_shape(record: Record, *, sharp: bool = False) -> tuple[Shape, Reading]:
     """Return the shape of a relay test, and how certain its numbers are.
 
     :param record: with at least one whole cycle.
-    :param sharp: True if the peaks are known to be sharp, however much noise there is.
+    :param sharp: as for :func:`shape_of_record`.
     :return: the shape, and those of its numbers that are called ``VARYING``.
-    :raises IdentificationError: if the record holds no whole cycle, or none about its set-point.
+    :raises IdentificationError: as :func:`shape_of_record`.
     """
-    cycles = limit_cycle(record).cycles if cycles_of(record) else ()
-    whole = fold(record, cycles, sharp=sharp)
-    shape = shape_of_fold(whole, _growth(record, whole.period))
 
     def numbers(part: Fold) -> FloatArray:
         found = shape_of_fold(part)
         return np.array([getattr(found, name) for name in VARYING])
 
-    return shape, Reading.of(record, cycles, numbers, sharp=sharp)
-
-
-def _growth(record: Record, period: float) -> float:
-    noise = 0.0 if math.isnan(record.noise_std) else record.noise_std
-    return growth_time(envelope(record), noise) / period
+    shape = shape_of_record(record, sharp=sharp)
+    return shape, Reading.of(record, limit_cycle(record).cycles, numbers, sharp=sharp)
 
 
 @dataclass(frozen=True)
