@@ -6,20 +6,28 @@
     . ./env.sh && python3 tools/report_images.py [BROWSER]
 
 With a browser that takes Chromium's options, such as `chromium`, it also takes pictures of the
-report's first screen and of the page on which gains are shaped.
+report's first screen and of the page on which gains are shaped, and a moving one of a live tune.
 """
 
 from __future__ import annotations
 
+import io
+import os
+import re
+import shlex
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from PIL import Image
 
 from relay_autotune.analysis import analyse
 from relay_autotune.cli import demo
+from relay_autotune.cli.own_nodes import free_domain
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
@@ -47,6 +55,7 @@ def main() -> int:
     if sys.argv[1:]:
         first_screen(sys.argv[1], case)
         page_in_browser(found)
+        live_tune(IMAGES / "live_tune.gif")
     for picture in (*IMAGES.glob("report_*.png"), IMAGES / "demo.png", IMAGES / "web_page.png"):
         # A palette is enough for lines and makes the file three times smaller; this one keeps rare
         # colours, such as those of the markers on a curve.
@@ -123,6 +132,113 @@ def page_in_browser(found: Analysis) -> None:
         )
         tab.wait("document.querySelectorAll('#plot-trade .curve').length === 2")
         tab.picture(IMAGES / "web_page.png")
+
+
+# A loop as the tutorial has it, and how long each still picture is shown [ms].
+_PLANT = (
+    "plant_node --ros-args -r measurement:=/tank/level -r command:=/tank/valve "
+    "-p structure:=fopdt -p gain:=1.65 -p 'time_constants:=[0.4]' -p dead_time:=0.2 "
+    "-p 'operating_point:=[40.0, 2.0]' -p noise_std:=0.02 -p sample_period:=0.02"
+)
+_TUNE = "tune_loop --measurement /tank/level --command /tank/valve --within 30 50 --web"
+_STILL, _MOVING = 3000, 700
+_TUNED_WITHIN = 120.0
+
+
+def live_tune(picture: Path, width: int = 1000, height: int = 720) -> dict[str, str]:
+    """Tune and prove a simulated loop on its page, as somebody does, and take a moving picture.
+
+    :param picture: the GIF.
+    :param width: of the window [pixels].
+    :param height: of the window [pixels].
+    :return: what the page says at the end: its status, the gains, and the number of taps.
+    """
+    sys.path.insert(0, str(ROOT / "test/support"))
+    from chromium import Chromium
+
+    frames: list[tuple[Image.Image, int]] = []
+    taps = 0
+    with (
+        _page_of_a_loop() as url,
+        tempfile.TemporaryDirectory() as folder,
+        Chromium(Path(folder)) as browser,
+    ):
+        tab = browser.tab()
+        tab.size(width, height)
+        tab.go(url)
+        shot = Path(folder) / "shot.png"
+
+        def look(shown: int) -> None:
+            tab.picture(shot)
+            frames.append((Image.open(io.BytesIO(shot.read_bytes())).convert("RGB"), shown))
+
+        def tap(selector: str, typed: str = "") -> None:
+            nonlocal taps
+            tab.wait(f"document.querySelector({selector!r})?.disabled === false", _TUNED_WITHIN)
+            tab.click(selector)
+            taps += 1
+            if typed:
+                tab.call("Input.insertText", text=typed)
+
+        def follow(phase: str) -> None:
+            tab.wait(f"document.body.dataset.phase === {phase!r}", _TUNED_WITHIN)
+            tab.eval("scrollTo(0, 0)")
+            deadline = time.monotonic() + _TUNED_WITHIN
+            while tab.eval("document.body.dataset.phase") != "idle":
+                assert time.monotonic() < deadline, tab.text("#live-status")
+                look(_MOVING)
+                time.sleep(0.001 * _MOVING)
+
+        tab.wait("document.body.dataset.measured > 2")
+        look(_STILL // 2)
+        tap("#start")
+        tap("#form-at-0", "2")
+        tap("#form-command_within-0", "0")
+        tap("#form-command_within-1", "5")
+        tab.wait("!document.querySelector('#plan-start').disabled")
+        look(_STILL)
+        tap("#plan-start")
+        follow("tuning")
+        look(_STILL)
+        tap("#prove")
+        tap("#question-yes")
+        follow("verifying")
+        tab.wait("!document.querySelector('#proof').hidden")
+        look(2 * _STILL)
+        told = {"status": tab.text("#live-status"), "gains": tab.text("#gains")}
+    # One palette for all, so that a frame holds only what has changed.
+    every = Image.new("RGB", (width, height * len(frames)))
+    for k, (image, _) in enumerate(frames):
+        every.paste(image, (0, k * height))
+    palette = every.quantize(160, Image.Quantize.MAXCOVERAGE)
+    plain = Image.Dither.NONE
+    first, *others = [image.quantize(palette=palette, dither=plain) for image, _ in frames]
+    durations = [shown for _, shown in frames]
+    first.save(
+        picture, save_all=True, append_images=others, duration=durations, loop=0, optimize=True
+    )
+    return {**told, "taps": str(taps)}
+
+
+@contextmanager
+def _page_of_a_loop() -> Iterator[str]:
+    """Start a simulated loop and the page that tunes it; yield its address."""
+    with free_domain() as domain, tempfile.TemporaryDirectory() as home:
+        around = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": home}
+        around |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "HOME": home}
+        plant = subprocess.Popen(shlex.split(_PLANT), env=around, stderr=subprocess.DEVNULL)
+        tune = subprocess.Popen(
+            shlex.split(_TUNE), env=around, text=True, stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        try:
+            assert tune.stderr is not None
+            lines = (re.search(r"page is at (\S+)", line) for line in tune.stderr)
+            yield next(found[1] for found in lines if found)
+        finally:
+            for process in (tune, plant):
+                process.terminate()
+                process.wait()
 
 
 if __name__ == "__main__":

@@ -528,6 +528,8 @@ class GainsPage:
                 self._do(wish, controller)
         except RelayAutotuneError as error:
             live.rest(str(error), good=False)
+        if live.told.window[1:] == (0.0,):
+            live.tell(window=(live.told.window[0], live.now))
         live.forget_wishes()
         self.look()
 
@@ -556,8 +558,7 @@ class GainsPage:
     def _prove(self, wish: PageCommand) -> None:
         """Prove gains by a controller_node of the command, which ends after it."""
         live, message = self.live, self._message(wish)
-        live.tell(phase="verifying", tone="warn", status="choosing the step", proof=())
-        live.show("proof", [])
+        self._begin_step("choosing the step")
         if self._tuned is None:
             raise TuningError("there are no gains of a tune that could be proven here")
         proof = Proof(self.loop, message, *self._tuned)
@@ -578,6 +579,15 @@ class GainsPage:
             ),
         )
 
+    def _begin_step(self, status: str) -> None:
+        """Show from now on the samples of a step in place of those of the tune."""
+        live = self.live
+        live.tell(
+            phase="verifying", tone="warn", status=status, proof=(), window=(live.now, 0.0),
+            setpoint=math.nan, levels=(),
+        )  # fmt: skip
+        live.show("proof", [])
+
     def _message(self, wish: PageCommand) -> Any:
         """Return the gains that the page shows as a message."""
         if wish.asked is None or not 0 <= wish.of < len(self.page.subjects):
@@ -596,8 +606,7 @@ class GainsPage:
 
     def _verify(self, wish: PageCommand, controller: GainsClient, new: Controller | None) -> None:
         live = self.live
-        live.tell(phase="verifying", tone="warn", proof=())
-        live.show("proof", [])
+        self._begin_step("")
         result = controller.prove(
             wish.step, 0.0, _REST_WITHIN, lambda text: live.tell(status=text), self.leave, new
         )

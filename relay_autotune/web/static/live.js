@@ -92,6 +92,9 @@ class Signal {
   get curve() { return { x: this.times.subarray(0, this.count), y: this.values.subarray(0, this.count) }; }
 }
 
+// Time without a key after which what was typed is looked at [ms].
+const TYPED = 500;
+
 // Time that is shown while no tune has run [s].
 const LAST = 60;
 
@@ -169,8 +172,11 @@ export class Live {
     $("plan-check").addEventListener("click", () => this.checkPlan());
     $("plan-start").addEventListener("click", () => this.startPlan());
     $("plan-leave").addEventListener("click", () => $("plan").close());
-    $("form").addEventListener("change", () => this.checkPlan());
-    $("form").addEventListener("input", () => { $("plan-start").disabled = true; });
+    $("form").addEventListener("input", () => {
+      $("plan-start").disabled = true;
+      clearTimeout(this.typing);
+      this.typing = setTimeout(() => this.checkPlan(), TYPED);
+    });
     $("form").addEventListener("submit", (event) => event.preventDefault());
     $("abort").addEventListener("click", () => send("abort"));
     this.model = new Plot($("plot-so-far"), { label: "Measurement so far, and the model", x: "time [s]", y: "measurement [y]" });
@@ -465,13 +471,18 @@ export class Live {
       $("form").append(row);
     }
     $("plan").showModal();
+    this.loop.planned = 0;
     this.checkPlan();
   }
 
   checkPlan() {
+    if (!$("plan").open) return;
     const settings = this.settings();
-    this.loop.planned = 0;
     $("plan-start").disabled = true;
+    // A check that runs is of other settings.
+    this.again = this.told.phase !== "idle" || this.told.checked < this.loop.planned;
+    if (this.again) return;
+    this.loop.planned = 0;
     if (!settings) { $("plan-said").textContent = "Fill in all of them: nothing moves before you start the tune."; $("plan-lines").replaceChildren(); return; }
     this.loop.planned = this.told.checked + 1;
     $("plan-said").textContent = "looking at the loop";
@@ -482,6 +493,7 @@ export class Live {
   showPlan() {
     const { told, loop } = this;
     if (!$("plan").open || !loop.planned || told.checked < loop.planned) return;
+    if (this.again) { this.checkPlan(); return; }
     $("plan-start").disabled = !told.accepted || told.phase !== "idle";
     $("plan-said").textContent = told.accepted ? "Nothing moves before you start the tune; it can be aborted at any time." : told.status;
     checklist($("plan-lines"), told.checks.filter(([mark, name]) => mark !== "ok" || PLAN.includes(name)));
