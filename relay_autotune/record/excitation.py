@@ -143,25 +143,28 @@ def _unbroken(record: Record) -> list[tuple[int, int]]:
     return list(zip(begins.tolist(), ends.tolist(), strict=True))
 
 
-def _saturated(y: FloatArray) -> np.ndarray:
-    """Return which samples are constant at an end of the measurement's range, but not at rest.
+def at_its_ends(y: FloatArray, band: float = 0.0) -> list[tuple[int, int, float]]:
+    """Return where a measurement stopped in mid-movement at an end of its range, and stayed.
 
-    A sensor or a process at its end stops the measurement in mid-movement. One at rest, as an
-    encoder at standstill, has slowed down before, or has not moved yet.
+    A sensor or a process at its end stops it so; where it comes to rest by itself it slows down.
+
+    :param y: the measurement [y], shape (n,).
+    :param band: distance from the end within which it stays, for noise [y].
+    :return: of each stay the first sample, the one after the last, and how far from the end the
+        measurement was just before, with the sign of the end [y].
     """
     low, high = float(np.min(y)), float(np.max(y))
-    still = np.zeros(y.size, dtype=np.bool_)
-    equal = np.diff(y) == 0.0
-    if low == high or float(np.mean(equal)) > 0.5:
-        # A coarsely quantised measurement, or one without noise at rest, is often constant.
-        return still
+    away = _AWAY * (high - low) + 3.0 * band
+    if not away < 0.5 * (high - low):
+        return []
     runs = []
     for end in (low, high):
-        edges = np.flatnonzero(np.diff(np.concatenate(([0], (y == end).astype(np.int8), [0]))))
+        there = (np.abs(y - end) <= band).astype(np.int8)
+        edges = np.flatnonzero(np.diff(np.concatenate(([0], there, [0]))))
         pairs = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
         runs += [(begin, stop, end) for begin, stop in pairs if stop - begin >= _SATURATED]
     if not runs:
-        return still
+        return []
     step = max(y.size // _MOST_FOR_SPEED, 1)
     few, coarse = 1, y[::step]
     # A spike between the samples that are looked at may be all of the range.
@@ -169,10 +172,21 @@ def _saturated(y: FloatArray) -> np.ndarray:
         np.max(np.abs(coarse[few:] - coarse[:-few])) < _CROSSED * (high - low)
     ):
         few += 1
-    for begin, stop, end in runs:
-        away = np.abs(y[max(begin - 2 * few * step, 0) : begin] - end)
-        if np.any(away > _AWAY * (high - low)):
-            still[begin:stop] = True
+    return [
+        (begin, stop, math.copysign(away, end - 0.5 * (low + high)))
+        for begin, stop, end in sorted(runs)
+        if np.any(np.abs(y[max(begin - 2 * few * step, 0) : begin] - end) > away)
+    ]
+
+
+def _saturated(y: FloatArray) -> np.ndarray:
+    """Return which samples are constant at an end of the measurement's range, but not at rest."""
+    still = np.zeros(y.size, dtype=np.bool_)
+    if float(np.mean(np.diff(y) == 0.0)) > 0.5:
+        # A coarsely quantised measurement, or one without noise at rest, is often constant.
+        return still
+    for begin, stop, _ in at_its_ends(y):
+        still[begin:stop] = True
     return still
 
 
@@ -339,8 +353,8 @@ def _settled(record: Record, last: int, changes: _Changes, noise: float) -> Floa
         final = float(np.median(part[-max(part.size // 5, 3) :]))
         band = max(_NOISE * noise, _SHARE * float(np.max(np.abs(part - final))))
         # One of many samples may lie far out by chance; the mean of five does not.
-        smooth = _smooth(part)
-        moving = np.flatnonzero(np.abs(smooth - final) > band)
+        level = smooth(part)
+        moving = np.flatnonzero(np.abs(level - final) > band)
         # A response below the noise may last until the next change.
         settled[k] = end if moving.size == 0 else record.time[low + moving[-1]]
     return settled
@@ -386,8 +400,12 @@ def _without_outliers(y: FloatArray) -> FloatArray:
     return np.concatenate((inner[:1], inner, inner[-1:]))
 
 
-def _smooth(y: FloatArray) -> FloatArray:
-    """Return means of five samples, since one of many may lie far out by chance."""
+def smooth(y: FloatArray) -> FloatArray:
+    """Return means of five samples each, since one of many may lie far out by chance.
+
+    :param y: shape (n,), n >= 5.
+    :return: shape (n - 4,).
+    """
     return np.convolve(y, np.full(5, 0.2), mode="valid")
 
 
@@ -401,10 +419,10 @@ def _moving(
     y = _without_outliers(record.measurement[first : last + 1])
     if y.size < 5:
         return []
-    smooth = _smooth(y)
+    level = smooth(y)
     reach = max(_NOISE * noise, _SHARE * float(np.ptp(y)))
-    leaves = np.flatnonzero(np.abs(smooth - smooth[0]) > reach)
-    comes = np.flatnonzero(np.abs(smooth - smooth[-1]) > reach)
+    leaves = np.flatnonzero(np.abs(level - level[0]) > reach)
+    comes = np.flatnonzero(np.abs(level - level[-1]) > reach)
     if not (leaves.size and comes.size):
         return []
     begin, end = record.time[first + leaves[0]], record.time[first + comes[-1] + 4]

@@ -173,7 +173,11 @@ def _fitted(records: Sequence[Record], fit: Fit, residual: FloatArray) -> FloatA
             colour=None,
         )
         columns, _ = every.columns(fit.state.theta)
-        return np.asarray(record.measurement[0] + scale * (fit.state.coefficients @ columns))
+        fitted = record.measurement[0] + scale * (fit.state.coefficients @ columns)
+        step = int(np.max(np.diff(problem.index), initial=1))
+        # What comes after the last of those is left out.
+        fitted[problem.index[-1] + step :] = math.nan
+        return np.asarray(fitted)
     own = problem.index < len(record)
     used = problem.index[own]
     fitted[used] = record.measurement[used] - scale * residual[own]

@@ -43,9 +43,10 @@ from relay_autotune.identification.waveform.separable import (
     problem_of,
     refine,
 )
+from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, TABLE
-from relay_autotune.record.excitation import changes_within
-from relay_autotune.record.record import Input, Record
+from relay_autotune.record.excitation import at_its_ends, changes_within, smooth
+from relay_autotune.record.record import Input, PiecewiseConstant, Record, roughness
 
 # Number of samples from which even a coarse measurement takes more than two values.
 _ENOUGH_FOR_TWO = 20
@@ -57,6 +58,10 @@ _MOST_OUTLIERS = 0.02
 # Largest share of the samples after a jump near the end that are left out, and the ratio by which
 # that divides the mean square of the residual.
 _MOST_LATE, _DIVIDED = 0.05, 0.5
+# Distance from the end of its range within which the mean of a few samples stays there, in
+# standard deviations of the noise and as a share of the range; samples that show whether the model
+# moves on.
+_STILL_NOISE, _STILL, _FEW = 3.0, 0.02, 500
 # Ratio of two records' noise up to which they count as equal.
 _ALIKE = 1.2
 _MOST_ROUNDS = 20
@@ -126,8 +131,44 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
     def chosen(samples: Problem) -> Fit:
         return chosen_fit(samples, known, sign, scale, held=held)
 
+    stopped = ""
+    if not sign and len(problem.bounds) == 1:
+        # Under a relay it turns around.
+        problem, stopped = _before_stop(problem, chosen)
     fit = _by_noise(problem, chosen(problem), chosen)
-    return _spared_of_outliers(problem, fit, known, chosen)
+    fit = _spared_of_outliers(problem, fit, known, chosen)
+    return replace(fit, warnings=(*fit.warnings, stopped)) if stopped else fit
+
+
+def _before_stop(problem: Problem, chosen: Callable[[Problem], Fit]) -> tuple[Problem, str]:
+    """Return the samples before a stop or the end of a sensor's range, and what is to be told.
+
+    The measurement stays at an end of its range in mid-movement, and the model of what comes
+    before moves on: there the process does not answer, or it is not seen.
+
+    :param problem: all samples.
+    :param chosen: fits samples.
+    """
+    u = problem.inputs[0]
+    if not isinstance(u, PiecewiseConstant):
+        return problem, ""
+    band = max(_STILL_NOISE * roughness(problem.y), _STILL)
+    for begin, stop, away in at_its_ends(smooth(problem.y), band):
+        before = problem.part(slice(0, begin))
+        if begin < _LEAST_SAMPLES or not changes_within(u, before.time).size:
+            continue
+        fit = chosen(before.thinned(_FEW))
+        model = fit.problem.structure.model_at(fit.state.theta, fit.state.coefficients)
+        if model is None or model.grows:
+            continue
+        on = response(model, problem.time[begin - 1 : stop], u)
+        if float(np.median(on[1:] - on[0])) / away > 1.0:
+            return before, (
+                f"from {problem.time[begin]:.4g} s on the measurement stays at an end of its "
+                "range, where the process would move on: a stop, or the sensor's end; it and all "
+                "after it were left out"
+            )
+    return problem, ""
 
 
 def _measured(records: Sequence[Record]) -> list[FloatArray]:

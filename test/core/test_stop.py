@@ -1,0 +1,59 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""A measurement that runs into a stop, or into the end of its sensor, in noise."""
+
+import numpy as np
+import pytest
+
+from relay_autotune import Record, identify
+from relay_autotune.analysis import analyse
+from relay_autotune.loop.analysis import ms_on
+from relay_autotune.process.response import response
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import PiecewiseConstant
+
+AXIS = TransferFunction(10.0, (), (0.8,), 1, 0.15)
+LAG = TransferFunction.fopdt(10.0, 0.8, 0.15)
+TIME = np.arange(0.0, 12.0, 0.05)
+
+
+def recorded(model, changes, levels, *, end=np.inf, noise=0.01):
+    u = PiecewiseConstant(np.array(changes), np.array(levels), 0.0)
+    y = np.minimum(response(model, TIME, u), end)
+    y += noise * np.ptp(y) * np.random.default_rng(7).standard_normal(TIME.size)
+    return Record(time=TIME, measurement=y, command=u(TIME), held_input=u)
+
+
+def told_of_a_stop(found):
+    return any("stays at an end of its range" in warning for warning in found.warnings)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("noise", [0.002, 0.01, 0.02])
+def test_a_stop_is_no_rest(noise):
+    # Gains of a process that would come to rest at the stop made this one grow.
+    found = analyse(recorded(AXIS, [3.0], [1.0], end=30.0, noise=noise), alone=True)
+    assert told_of_a_stop(found.model)
+    assert found.best_gains is None or ms_on(found.best_gains, AXIS) < 1.75
+
+
+def test_what_lies_at_the_end_of_a_sensor_is_left_out():
+    found = identify(recorded(LAG, [3.0], [1.0], end=6.0))
+    assert told_of_a_stop(found)
+    # At the stop lies nothing that was fitted.
+    assert np.isnan(found.fitted[TIME > 6.0]).all()
+    assert found.ultimate_gain == pytest.approx(ultimate_point(LAG).gain, rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("model", "changes", "levels"),
+    [
+        (AXIS, [3.0, 4.5], [1.0, 0.0]),
+        (AXIS, [3.0, 4.0, 8.0, 9.0], [1.0, 0.0, -1.0, 0.0]),
+        (LAG, [3.0, 8.0], [1.0, 0.0]),
+    ],
+)
+def test_a_process_that_comes_to_rest_stands_at_no_stop(model, changes, levels):
+    assert not told_of_a_stop(identify(recorded(model, changes, levels)))
