@@ -32,7 +32,7 @@ from relay_autotune.cli.arguments import (
     say,
 )
 from relay_autotune.cli.table import compared_lines, rows, table
-from relay_autotune.cli.terminal import WIDEST
+from relay_autotune.cli.terminal import WIDEST, Stages
 from relay_autotune.errors import NotThereError, RelayAutotuneError, SelectionError, defect
 from relay_autotune.exchange.export import EXPORTS, WITHOUT_LAW, Target, exported
 from relay_autotune.identification.known import Known
@@ -54,7 +54,6 @@ if TYPE_CHECKING:
     from relay_autotune.web.shape import DesignRequest
 
 Progress = Callable[[int, int], None]
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -120,17 +119,17 @@ def work(job: Job) -> Done:
 
 
 def replay(
-    job: Job, progress: Progress | None = None, tell: Tell = lambda _: None
+    job: Job, progress: Progress | None = None, stages: Stages | None = None
 ) -> tuple[Done, tuple[Analysis, ...]]:
     """Read, identify and tune; return also the analyses themselves.
 
     :param job: what to do.
     :param progress: called with how much of a bag is read, and of how much.
-    :param tell: called with the stage of the computation, in words.
+    :param stages: tells what the computation is at.
     """
     said: list[str] = []
     try:
-        analyses = analysed(job, said, progress, tell)
+        analyses = analysed(job, said, progress, stages)
         if job.export is not None:
             gains, text = _exported(analyses, *job.export, accept_doubtful=job.accept_doubtful)
             said += [f"{job.name}: {warning}" for warning in gains.warnings]
@@ -171,14 +170,14 @@ def status_of(analyses: Sequence[Analysis]) -> int:
 
 
 def analysed(
-    job: Job, said: list[str], progress: Progress | None = None, tell: Tell = lambda _: None
+    job: Job, said: list[str], progress: Progress | None = None, stages: Stages | None = None
 ) -> tuple[Analysis, ...]:
     """Read, identify and tune.
 
     :param job: what to do.
     :param said: gets sentences for standard error.
     :param progress: called with how much of a bag is read, and of how much.
-    :param tell: called with the stage of the computation, in words.
+    :param stages: tells what the computation is at.
     :raises RelayAutotuneError: if the recording cannot be read, or lacks what is asked for.
     """
     if job.jointly:
@@ -187,6 +186,8 @@ def analysed(
             recording = read_experiments(path, job.selection, progress)
             said += [f"{path}: {note}" for note in recording.notes]
             records += recording.experiments
+        if stages is not None:
+            stages.begin(map(len, records))
         return (analyse_jointly(records, **vars(job.task)),)
     try:
         recording = read_experiments(job.paths, job.selection, progress)
@@ -197,6 +198,9 @@ def analysed(
         own = replace(job.selection, measurement=None, command=None, time=None)
         recording = read_experiments(job.paths, own, progress)
     said += [f"{job.name}: {note}" for note in recording.notes]
+    if stages is not None:
+        stages.begin(map(len, recording.experiments))
+    tell = stages or (lambda _: None)
     found = tuple(analyse(each, **vars(job.task), tell=tell) for each in recording.experiments)
     return agreed(found) if recording.of_one_process else found
 

@@ -243,7 +243,7 @@ def _cases(job: Job) -> list[Case]:
     said: list[str] = []
     try:
         with Stages(ProgressLine(f"{PROGRAM}: {job.name} read")) as stages:
-            found = analysed(job, said, tell=stages)
+            found = analysed(job, said, stages=stages)
         return [case_of(analysis, job.name) for analysis in found]
     finally:
         for sentence in said:

@@ -16,7 +16,7 @@ import termios
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -261,7 +261,7 @@ class ProgressLine:
 
 
 class Stages:
-    """Say each second on a terminal what the computation of a model is at, until the block ends.
+    """Say what the computation of models is at, and how long it will take, until the block ends.
 
     :param before: a line that is shown until then.
     """
@@ -271,14 +271,22 @@ class Stages:
         self._stack = ExitStack()
         self._working: Working | None = None
 
+    def begin(self, samples: Iterable[int]) -> None:
+        """Begin to compute.
+
+        :param samples: number of samples of each record.
+        """
+        # Imported here, because a question needs no arrays.
+        from relay_autotune.expected_time import expected_time
+
+        self._before.clear()
+        working = Working("computing the model", expected_time(*samples))
+        self._working = self._stack.enter_context(working)
+
     def __call__(self, stage: str) -> None:
         """Note what begins."""
-        if not sys.stderr.isatty():
-            return
-        if self._working is None:
-            self._before.clear()
-            self._working = self._stack.enter_context(Working("computing the model"))
-        self._working.at(stage)
+        if self._working is not None:
+            self._working.at(stage)
 
     def __enter__(self) -> Stages:
         return self
@@ -291,11 +299,15 @@ class Stages:
 class Working:
     """Say each second on standard error what is being done, until the block ends.
 
+    Without a terminal it is said each ten seconds. Where it is known how long the work takes, it
+    is said at once, there only if that is longer.
+
     :param what: what is being done.
+    :param expected: how long it takes about [s]; NaN: not known.
     """
 
-    def __init__(self, what: str) -> None:
-        self._what = what
+    def __init__(self, what: str, expected: float = math.nan) -> None:
+        self._what, self._expected = what, expected
         self._stage = ""
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._tell, name="progress", daemon=True)
@@ -317,10 +329,17 @@ class Working:
 
     def _tell(self) -> None:
         began, line = time.monotonic(), StatusLine()
+        known = math.isfinite(self._expected)
+        about = f" of about {max(self._expected, 1.0):.0f} s" if known else ""
         wait = _SOON if line.in_place else TOLD_EVERY
+        if known and self._expected < LOGGED_EVERY and not line.in_place:
+            wait = LOGGED_EVERY
         while not self._over.wait(wait):
             wait = TOLD_EVERY if line.in_place else LOGGED_EVERY
-            line(f"{self._what}, {duration(time.monotonic() - began)}{self._stage}")
+            ran = time.monotonic() - began
+            if known and ran > self._expected:
+                about = f", about {max(self._expected, 1.0):.0f} s were expected"
+            line(f"{self._what}, {duration(ran)}{about}{self._stage}")
         line.clear()
 
 

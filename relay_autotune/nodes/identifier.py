@@ -31,6 +31,7 @@ from relay_autotune.exchange.messages import (
     record_from_message,
     start_nanoseconds,
 )
+from relay_autotune.expected_time import expected_time
 from relay_autotune.experiment.early_end import ULTIMATE_GAIN, FitProgress
 from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.identification.result import Identification
@@ -229,7 +230,12 @@ class IdentifierNode(ServedNode):
         if asked["method"] in ONLY_JOINT and earlier is not None:
             return partial(analyse_jointly, (record, earlier), **asked)
         # Those who wait for the gains need none of the other rules'.
-        return partial(analyse, record, **asked, tell=self._signs.at, alone=True)
+        about = max(expected_time(len(record), alone=True), 1.0)
+
+        def tell(stage: str) -> None:
+            self._signs.at(f"{stage}, about {about:.0f} s in all")
+
+        return partial(analyse, record, **asked, tell=tell, alone=True)
 
     # Output.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import io
 import sys
+import time
 from dataclasses import replace
 
 import pytest
@@ -15,7 +16,7 @@ from analysed import completed
 
 from relay_autotune.cli import arguments, terminal, tune
 from relay_autotune.cli.table import table
-from relay_autotune.cli.terminal import labelled
+from relay_autotune.cli.terminal import Working, labelled
 
 COMMANDS = ("replay", "report", "tune", "identify", "csv_to_bag", "tune_loop", "apply_gains")
 
@@ -79,3 +80,24 @@ def test_quantities_on_a_line_stay_with_their_units():
 def test_a_label_that_fills_its_column_has_a_space_after_it():
     for label in ("gain", "experiment 1 of 12"):
         assert labelled(label, "2.067e+04 s", 80)[0].split(label)[1].startswith(" ")
+
+
+@pytest.mark.parametrize(
+    ("expected", "first"),
+    [(0.02, "0.2 s, about 1 s were expected"), (20.0, "about 20 s")],
+)
+def test_a_log_has_a_line_each_ten_seconds_and_at_once_what_takes_longer(
+    expected, first, capsys, monkeypatch
+):
+    # ten seconds and less than one, two hundred times faster
+    monkeypatch.setattr(terminal, "LOGGED_EVERY", 0.2)
+    monkeypatch.setattr(terminal, "TOLD_EVERY", 0.004)
+    with Working("the work", expected) as working:
+        working.at("comparing")
+        for _ in range(1000):
+            lines = capsys.readouterr().err.splitlines()
+            if lines:
+                break
+            time.sleep(0.01)
+    assert first in lines[0]
+    assert lines[0].endswith(": comparing")

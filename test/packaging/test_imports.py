@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # know each other.
 FLOORS = (
     {"errors", "threads", "arrays"},
-    {"text"},
+    {"text", "expected_time"},
     {"quantities", "reasons"},
     {"record", "verdict"},
     {"process"},
