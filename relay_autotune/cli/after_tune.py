@@ -199,6 +199,7 @@ class Proof:
 
 
 _UNFINISHED = "the proof did not end"
+_FAILED = "the step that was to prove them failed: {}"
 
 
 @dataclass(frozen=True)
@@ -393,10 +394,10 @@ class AfterTune:
             the commands that follow, each with its purpose.
         """
         options, loop, gains = self.options, self.loop, self.gains
-        proven, against, steps = None, "", list[tuple[str, str]]()
-        if loop.proves:
-            proven, against = self._proven()
-            steps = [] if against else self._own_controller()
+        steps = list[tuple[str, str]]()
+        proven, against = self._tried()
+        if loop.proves and not against:
+            steps = self._own_controller()
         first = _Written(gains, exports_of(gains.law)[0], against or self.doubt)
         written, file = first, options.export
         if loop.proves and not (file or options.yes) and sys.stdin.isatty():
@@ -407,8 +408,6 @@ class AfterTune:
             law = {"law": written.gains.law, "sample_period": written.gains.law_period}
             again = as_typed(PROGRAM, self.parser, options, verify=None, **law)
             steps.append((f"prove those for {written.how}", f"{prefix()}{again} --verify"))
-        if (status := loop.apply(written.doubt)) is not None:
-            proven = status == DONE
         return proven, steps
 
     def _write(self, written: _Written, file: str) -> None:
@@ -513,22 +512,29 @@ class AfterTune:
 
     # Their proof.
 
-    def _proven(self) -> tuple[bool | None, str]:
-        """Offer to prove the gains of a tune.
+    def _tried(self) -> tuple[bool | None, str]:
+        """Offer to prove the gains of a tune, or to put them in force at a joint.
 
-        However it ends, the command is then that at which the process rested before the tune.
+        Without a controller of its own, the command is then that at which the process rested
+        before the tune, however it ends.
 
-        :return: whether the proof has passed, None: none was wanted; and what speaks against the
+        :return: whether that has succeeded, None: it was not wanted; and what speaks against the
             gains in the end, empty: nothing.
         """
+        loop = self.loop
         passed, against = None, _UNFINISHED
         try:
-            passed, against = self._offered()
+            if loop.proves:
+                passed, against = self._offered()
+            else:
+                passed, failed = loop.apply(self.doubt)
+                against = _FAILED.format(failed) if failed else ""
         except RelayAutotuneError as error:
             say(PROGRAM, f"the gains are not proven: {error}")
             passed, against = False, f"not proven: {error}"
         finally:
-            self._say_what_is_left(against)
+            if loop.proves:
+                self._say_what_is_left(against)
         return passed, against
 
     def _offered(self) -> tuple[bool | None, str]:
@@ -553,7 +559,7 @@ class AfterTune:
         found = self._made(proof, step)
         if found.passed:
             return True, ""
-        return False, f"the step that was to prove them failed: {found.reason}"
+        return False, _FAILED.format(found.reason)
 
     def _made(self, proof: Proof, step: float) -> Any:
         """Make the step, and show what it has found."""

@@ -117,10 +117,13 @@ def _work(options: argparse.Namespace, graph: ExitStack) -> int:
     if options.revert:
         print(client.ask("revert"))
         return DONE
-    return apply_and_verify(client, options)
+    in_force, _ = apply_and_verify(client, options)
+    return DONE if in_force else NOTHING_FOUND
 
 
-def apply_at(name: str, beside: LoopClient, *, doubtful: bool, yes: bool, patience: float) -> int:
+def apply_at(
+    name: str, beside: LoopClient, *, doubtful: bool, yes: bool, patience: float
+) -> tuple[bool, str]:
     """Offer the newest gains to a controller_node that ends with this command.
 
     :param name: its full name.
@@ -128,7 +131,7 @@ def apply_at(name: str, beside: LoopClient, *, doubtful: bool, yes: bool, patien
     :param doubtful: True: also gains whose verdict is not trusted.
     :param yes: True: do not ask.
     :param patience: how long to look for it [s].
-    :return: the exit status.
+    :return: as of :func:`apply_and_verify`.
     """
     from relay_autotune.nodes.gains_client import GainsClient
 
@@ -162,11 +165,12 @@ def _require_trust(doubt: str, options: argparse.Namespace) -> None:
         )
 
 
-def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
-    """Show the gains, ask, apply and verify them; return the exit status.
+def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[bool, str]:
+    """Show the gains, ask, apply and verify them.
 
     :param client: of the controller_node, which was found.
     :param options: as the command line gives them.
+    :return: whether the gains are in force, and why their step failed; empty: it did not.
     """
     with Working("asking for the gains"):
         present, model, noise = client.in_force(), client.model(), client.noise()
@@ -190,13 +194,13 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
         agreed = agrees(question, yes=options.yes)
     if not agreed:
         say(PROGRAM, "nothing was changed")
-        return NOTHING_FOUND
+        return False, ""
     if options.accept_doubtful:
         client.set_values(client.name, {"accept_doubtful": True})
     if options.no_verify:
         client.ask("apply")
         print(f"  {'gains':<16} in force, not verified; {PROGRAM} --verify-only makes the step")
-        return DONE
+        return True, ""
     shown = StatusLine()
     new = None if options.verify_only else gains
     with noted(lambda text: say(PROGRAM, text)) as leave:
@@ -218,7 +222,7 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> int:
             entries.insert(-1, ("predicted", f"{told} every {gains.law_period:g} s"))
         for entry in entries:
             tell(*entry)
-    return DONE if result.passed else NOTHING_FOUND
+    return result.passed, "" if result.passed else result.reason
 
 
 def _usual_step(client: GainsClient, options: argparse.Namespace) -> float:

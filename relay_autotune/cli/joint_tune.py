@@ -16,7 +16,7 @@ from typing import Any
 import yaml
 
 from relay_autotune.cli.apply_gains import apply_at
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say
+from relay_autotune.cli.arguments import say
 from relay_autotune.cli.loops import Loop, Steps
 from relay_autotune.cli.own_nodes import (
     PROGRAM,
@@ -529,21 +529,22 @@ class JointLoop(Loop):
                 return [("activate its controller", typed)]
         return []
 
-    def apply(self, doubt: str) -> int | None:
-        """Offer the gains to the controller, verify them, and return the exit status.
+    def apply(self, doubt: str) -> tuple[bool | None, str]:
+        """Offer the gains to the controller, and verify them.
 
         :param doubt: why they are doubtful; empty: they are trusted.
-        :return: None: the controller keeps the gains that it has.
+        :return: whether they are in force, None: the controller keeps those that it has as asked
+            for; and why their step failed; empty: it did not.
         """
         if self.options.keep_gains:
-            return None
+            return None, ""
         print()
         if doubt and self.options.yes:
             say(PROGRAM, f"the gains are doubtful, so that --yes does not apply them: {doubt}")
-            return None
+            return None, ""
         loop = self._loop
         if loop.why_not_moved:
-            return self._set()
+            return self._set(), ""
         places = ",".join(map("{}:{}".format, *zip(*loop.places.items(), strict=True)))
         topics, values = self._at_controller()
         values |= {
@@ -572,8 +573,8 @@ class JointLoop(Loop):
             self.nodes.end("controller_node")
             raise GoneError(f"{error}; {self._put_back()}") from error
 
-    def _set(self) -> int:
-        """Set the gains of a controller whose references nobody can move; return the status."""
+    def _set(self) -> bool:
+        """Set the gains of a controller whose references nobody can move; return whether."""
         loop, client = self._loop, self._client
         found = self.client.result
         gains = gains_from_message(found.gains)
@@ -584,7 +585,7 @@ class JointLoop(Loop):
         question = f"Set {self._places} of {loop.node}, without a step that verifies them?"
         if not agrees(question, yes=self.options.yes):
             say(PROGRAM, "nothing was changed")
-            return NOTHING_FOUND
+            return False
         put_gains(client, loop.node, wanted, before)
         moved = f"move it by {loop.above[-1]}" if loop.above else "give it a short trajectory"
         for label, text in (
@@ -599,7 +600,7 @@ class JointLoop(Loop):
         if loop.follows:
             # In one line, so that it can be copied.
             print(f"  {self._short_trajectory(gains.settling_time)}")
-        return DONE
+        return True
 
     def _short_trajectory(self, settling_time: float) -> str:
         """Return what to type for a small motion of the joint.

@@ -152,12 +152,13 @@ class Loop:
         """Where exported gains go."""
         return Target()
 
-    def apply(self, doubt: str) -> int | None:  # noqa: ARG002  see JointLoop
-        """Offer the gains to its controller; return the exit status, None: there is none.
+    def apply(self, doubt: str) -> tuple[bool | None, str]:  # noqa: ARG002  see JointLoop
+        """Offer the gains to its controller.
 
         :param doubt: why they are doubtful; empty: they are trusted.
+        :return: whether they are in force, None: it has no controller; and why their step failed.
         """
-        return None
+        return None, ""
 
 
 class TopicLoop(Loop):

@@ -154,7 +154,7 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     monkeypatch.setattr("relay_autotune.cli.terminal._await_line", lambda shown: None)
     monkeypatch.setattr("builtins.input", lambda: answers.pop(0))
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
-    assert apply_gains.apply_and_verify(client, given) == 1
+    assert apply_gains.apply_and_verify(client, given) == (False, "")
     told = capsys.readouterr()
     assert "a step of the set-point by 2 y" in told.out
     assert "from -1.5 to 2 y" in told.err
@@ -198,7 +198,7 @@ def test_a_prediction_by_another_law_than_that_of_the_design_is_told_as_such(
         client.waiting = lambda: (for_law, "")
         client.values = lambda node, names, to=target: {"apply_to": to}
         given = apply_gains._parser().parse_args(["--yes", "--step", "0.5"])
-        assert apply_gains.apply_and_verify(client, given) == 0
+        assert apply_gains.apply_and_verify(client, given) == (True, "")
         shown = " ".join(capsys.readouterr().out.split())
         before, _, last = shown.rpartition("gains in force")
         assert before.count("are for control_toolbox_legacy every 0.01 s") == told
@@ -212,12 +212,12 @@ def test_new_gains_that_could_not_be_taken_back_are_told_as_such(
     given = apply_gains._parser().parse_args(["--yes", "--step", "0.5"])
     present: list[Any] = [Controller(0.1, 3.0)]
     client = client_of(lambda *words: present.append(GAINS) or failed, lambda: present[-1])
-    assert apply_gains.apply_and_verify(client, given) == 1
+    assert apply_gains.apply_and_verify(client, given) == (False, failed.reason)
     told = " ".join(capsys.readouterr().out.split("gains in force")[-1].split())
     assert "these are the new ones, which are not proven" in told
     present[:] = [Controller(0.1, 3.0)]
     client = client_of(lambda *words: present.append(None) or failed, lambda: gone(present))
-    assert apply_gains.apply_and_verify(client, given) == 1
+    assert apply_gains.apply_and_verify(client, given) == (False, failed.reason)
     told = " ".join(capsys.readouterr().out.split())
     assert "gains in force not known: it is gone; before the proof: kc 0.1000, ti 3.000" in told
 

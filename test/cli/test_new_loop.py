@@ -693,6 +693,7 @@ def shown(
         command_within: list[float] | None = given.command_within,
         export: str | None = None,
         accept_doubtful: bool = False,
+        at_joint: bool = False,
     ) -> str:
         typed.extend(answers)
         given.command_within = command_within
@@ -702,6 +703,9 @@ def shown(
         monkeypatch.setattr(AfterTune, "_offered", lambda _: (passed, against))
         loop = topic_loop(client, given)
         loop.nodes = nodes
+        if at_joint:
+            loop.proves = False
+            loop.apply = lambda doubt: (passed, against)  # type: ignore[method-assign]
         loop.arguments = lambda: {"relay_node": words}  # type: ignore[method-assign]
         proven, steps = AfterTune(loop, parser).hand_over()
         assert proven is passed
@@ -746,6 +750,20 @@ def test_doubtful_gains_are_exported_unasked_by_a_flag_alone(
     assert not file.exists()
     shown(None, "few cycles", export=str(file), accept_doubtful=True)
     assert file.read_text().startswith("# DOUBTFUL: few cycles")
+
+
+def test_gains_that_failed_at_a_joint_are_exported_with_that_or_not_at_all(
+    shown: Callable[..., str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    file = tmp_path / "gains.yaml"
+    shown(False, "it runs away", bag="tune", export=str(file), at_joint=True)
+    assert not file.exists()
+    shown(False, "it runs away", export=str(file), accept_doubtful=True, at_joint=True)
+    first = file.read_text().splitlines()[0]
+    assert first == "# DOUBTFUL: the step that was to prove them failed: it runs away"
+    file.unlink()
+    shown(True, "", export=str(file), at_joint=True)
+    assert "DOUBTFUL" not in file.read_text()
 
 
 def test_a_program_that_is_named_gets_gains_of_its_own_and_a_start_without_a_bump(

@@ -499,7 +499,7 @@ def test_a_proof_that_is_lost_tells_how_its_joint_is_left(monkeypatch, off, take
 def test_doubtful_gains_are_not_applied_unasked_and_that_is_no_failure(capsys) -> None:
     """The exit status is then that of doubtful gains, and not that of none."""
     tune = SimpleNamespace(options=SimpleNamespace(keep_gains=False, yes=True))
-    assert JointLoop.apply(tune, "few cycles") is None
+    assert JointLoop.apply(tune, "few cycles") == (None, "")
     assert "so that --yes does not apply them: few cycles" in capsys.readouterr().err
 
 
