@@ -37,6 +37,7 @@ from relay_autotune.arrays import ComplexArray, FloatArray, IntArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Margins
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.scalar import roots
 
 _PIECES = 128
 _BRANCH_PARTS = 4
@@ -304,8 +305,8 @@ Loop = Callable[[ComplexArray], ComplexArray]
 # Number of local maxima to refine, since the largest on the grid need not be the largest.
 _PEAKS = 4
 _ZOOMS, _ZOOM_POINTS = 9, 9
-# Most rounds for a root, and the change of its logarithm that ends them.
-_ROUNDS, _EXACT = 60, 1e-13
+# Accuracy of the logarithm of a frequency.
+_EXACT = 1e-13
 # Below this magnitude the loop has no influence.
 _RELEVANT = 0.05
 _PER_DECADE = 50
@@ -432,30 +433,6 @@ def _changes(values: FloatArray) -> NDArray[np.intp]:
     return np.flatnonzero((values[:-1] >= 0.0) != (values[1:] >= 0.0))
 
 
-def _roots(
-    function: Callable[[FloatArray], FloatArray], low: FloatArray, high: FloatArray
-) -> FloatArray:
-    """Return a root in each cell with a change of sign, of all cells at once.
-
-    The Illinois method: a secant between two values of different sign, where an end that stays
-    counts half (Dowell and Jarratt 1971, BIT 11, 168).
-    """
-    low, high = np.log(low), np.log(high)
-    if not low.size:
-        return low
-    at_low, at_high = function(np.exp(low)), function(np.exp(high))
-    for _ in range(_ROUNDS):
-        x = high - at_high * ((high - low) / (at_high - at_low))
-        value = function(np.exp(x))
-        stays = (value >= 0.0) == (at_high >= 0.0)
-        low, at_low = np.where(stays, low, high), np.where(stays, 0.5 * at_low, at_high)
-        moved = float(np.abs(x - high).max())
-        high, at_high = x, value
-        if moved <= _EXACT:
-            break
-    return np.asarray(np.exp(high))
-
-
 def margins(loop: Loop, grid: FloatArray, at_rest: float | None = None) -> LoopMargins:
     """Return the margins of a stable loop.
 
@@ -463,17 +440,23 @@ def margins(loop: Loop, grid: FloatArray, at_rest: float | None = None) -> LoopM
     :param grid: frequencies fine enough to show every crossing [rad/s], increasing.
     :param at_rest: L(0), if it is finite; None: it is not finite.
     """
-    values = loop(1j * grid)
+    values, log_grid = loop(1j * grid), np.log(grid)
+
+    def log_ends(cells: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+        return log_grid[cells], log_grid[cells + 1]
+
     cells = _changes(values.imag)
     cells = cells[(values.real[cells] < 0.0) | (values.real[cells + 1] < 0.0)]
-    crossings = _roots(lambda w: loop(1j * w).imag, grid[cells], grid[cells + 1])
+    crossings = np.exp(roots(lambda x: loop(1j * np.exp(x)).imag, *log_ends(cells), _EXACT))
     real = loop(1j * crossings).real if crossings.size else np.empty(0)
     gains = -1.0 / real[real < 0.0]
     if at_rest is not None and at_rest < 0.0:
         gains = np.append(gains, -1.0 / at_rest)
     size = np.log(np.abs(values))
     cells = _changes(size)
-    crossovers = _roots(lambda w: np.log(np.abs(loop(1j * w))), grid[cells], grid[cells + 1])
+    crossovers = np.exp(
+        roots(lambda x: np.log(np.abs(loop(1j * np.exp(x)))), *log_ends(cells), _EXACT)
+    )
     lead = np.angle(-loop(1j * crossovers)) if crossovers.size else np.empty(0)
     delays = np.mod(lead, 2.0 * math.pi) / crossovers
     (ms, at), (mt, _) = peaks(loop, grid)

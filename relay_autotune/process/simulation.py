@@ -23,13 +23,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.process.response import Coordinates, Modes
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Cycle, Outcome, PiecewiseConstant, Record, RelaySettings
+from relay_autotune.scalar import root
 
 
 class HalfCycle:
@@ -167,13 +167,9 @@ class RelayRun:
         )
 
 
-def _root(function: Callable[[float], float], low: float, high: float) -> float:
-    ends = function(low), function(high)
-    if ends[0] * ends[1] >= 0.0:
-        # The change of sign in the vectorised evaluation was rounding.
-        return low if abs(ends[0]) <= abs(ends[1]) else high
+def _at_zero(function: Callable[[float], float], grid: FloatArray, i: int) -> float:
     # The tolerance is relative to the cell, because the root may lie at or near zero.
-    return float(brentq(function, low, high, xtol=1e-16 * high, rtol=1e-15, maxiter=1000))
+    return root(function, grid[i], grid[i + 1], 1e-16 * grid[i + 1])
 
 
 class _Piece:
@@ -223,7 +219,7 @@ class _Piece:
         grid = np.unique(np.concatenate(parts))
         slope = self._rates.outputs(self._states, grid)[0]
         cells = np.flatnonzero(slope[:-1] * slope[1:] < 0.0)
-        return np.unique(np.append(grid, [_root(self._slope, *grid[i : i + 2]) for i in cells]))
+        return np.unique(np.append(grid, [_at_zero(self._slope, grid, i) for i in cells.tolist()]))
 
     def first_rise(self, excess: Callable[[FloatArray], FloatArray], length: float) -> float:
         """First time at which ``excess(y)`` passes zero upwards; nan if it does not."""
@@ -235,7 +231,7 @@ class _Piece:
         i = int(cells[0])
         if f[i] >= -self._rounding:
             return float(at[i])
-        return _root(lambda time: float(excess(self.output(time))[0]), *at[i : i + 2])
+        return _at_zero(lambda time: float(excess(self.output(time))[0]), at, i)
 
 
 def simulate_relay(

@@ -12,6 +12,7 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.scalar import roots
 
 _LARGE = 300.0
 _WIDTHS = np.linspace(-8.0, 8.0, 65)
@@ -155,8 +156,6 @@ class Polar:
         return float(self._parts(np.array([place]))[1][0])
 
 
-_MOST_STEPS = 100
-_ACCURACY = 2e-16
 _MOST_POINTS = 200_000
 
 
@@ -302,7 +301,7 @@ def _scan(polar: Polar, grid: FloatArray) -> list[_Crossing]:
     # A falling phase crosses its present level, a rising one the next level.
     target = np.maximum(level[cells], level[cells + 1])
     falls = level[cells + 1] < level[cells]
-    place = _roots(polar, grid[cells], grid[cells + 1], target)
+    place = roots(lambda at: polar.turns(at, target), grid[cells], grid[cells + 1])
     with np.errstate(over="ignore"):
         frequency, gain = np.exp(place), np.exp(-polar.size(place))
     usable = np.isfinite(frequency) & np.isfinite(gain) & (frequency > 0.0) & (gain > 0.0)
@@ -311,33 +310,3 @@ def _scan(polar: Polar, grid: FloatArray) -> list[_Crossing]:
         for g, w, fall, good in zip(gain, frequency, falls, usable, strict=True)
         if good
     ]
-
-
-def _roots(polar: Polar, low: FloatArray, high: FloatArray, target: FloatArray) -> FloatArray:
-    """Return where the phase has a number of turns, all at once by the Illinois method.
-
-    :param low: log frequencies at one side of each root, shape (n,).
-    :param high: at the other, shape (n,).
-    :param target: turns, shape (n,).
-    """
-    at_low, at_high = polar.turns(low, target), polar.turns(high, target)
-    place, moved = low, np.full(low.shape, 2)
-    for _ in range(_MOST_STEPS):
-        before = place
-        with np.errstate(divide="ignore", invalid="ignore"):
-            place = (low * at_high - high * at_low) / (at_high - at_low)
-        # Rounding may place the root at an end, or a little beyond.
-        place = np.clip(np.where(np.isfinite(place), place, low), low, high)
-        if bool(np.all(np.abs(place - before) <= _ACCURACY * np.maximum(np.abs(place), 1.0))):
-            break
-        value = polar.turns(place, target)
-        below = np.sign(value) == np.sign(at_low)
-        # Illinois: halve the value at an end that stays twice, so that both ends converge.
-        again = np.where(below == moved, 0.5, 1.0)
-        at_low, at_high = (
-            np.where(below, value, again * at_low),
-            np.where(below, again * at_high, value),
-        )
-        moved = below
-        low, high = np.where(below, place, low), np.where(below, high, place)
-    return place

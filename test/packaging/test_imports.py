@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # know each other.
 FLOORS = (
     {"errors", "threads", "arrays"},
-    {"text", "expected_time"},
+    {"expected_time", "scalar", "text"},
     {"quantities", "reasons"},
     {"record", "verdict"},
     {"process"},
@@ -35,8 +35,9 @@ FLOORS = (
 )
 FLOOR_OF = {name: number for number, names in enumerate(FLOORS) for name in sorted(names)}
 # What brings ROS in; all else runs without it.
-NUMERIC = ("errors", "reasons", "quantities", "record", "process", "experiment", "identification",
-           "loop", "control", "tuning", "result", "analysis", "exchange")  # fmt: skip
+NUMERIC = ("errors", "reasons", "quantities", "scalar", "record", "process", "experiment",
+           "identification", "loop", "control", "tuning", "result", "analysis",
+           "exchange")  # fmt: skip
 FOREIGN = {"numpy", "scipy"}
 
 

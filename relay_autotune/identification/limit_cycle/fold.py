@@ -29,9 +29,10 @@ from scipy.special import stdtrit
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.minimum import minimum_near
+from relay_autotune.identification.estimate import carried
 from relay_autotune.record.cycles import find_cycles, limit_cycle, settings_of
 from relay_autotune.record.record import Record, RelaySettings, cached_on_record
+from relay_autotune.scalar import minimum_near
 
 _RIDGE = 1e-13
 _TOLERANCE = 1e-7
@@ -386,6 +387,16 @@ class Reading:
         if self.covariance is None:
             return np.full(self.values.size, math.nan)
         return np.sqrt(np.diag(self.covariance))
+
+    def carried(self, function: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        """Return the covariance of a function of the numbers, NaN where none was estimated.
+
+        :param function: from numbers, shape (n,), to values, shape (p,).
+        """
+        if self.covariance is not None:
+            return carried(function, self.values, self.covariance)
+        size = function(self.values).size
+        return np.full((size, size), math.nan)
 
     def with_number(self, i: int, value: float, std: float) -> Reading:
         """Return the reading with a number that is known otherwise, independently of the others.

@@ -25,10 +25,10 @@ from scipy.special import fdtrc
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.limit_cycle.fold import Fold, Reading, fold
-from relay_autotune.minimum import minimum_near
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.record.cycles import cycles_of, limit_cycle, settings_of
 from relay_autotune.record.record import Record, cached_on_record
+from relay_autotune.scalar import minimum_near
 
 _LEAST_PEAKS = 6
 _QUICKEST = 0.1

@@ -49,6 +49,7 @@ from relay_autotune.process.structures import (
     TWO_EQUAL_ONE,
     Structure,
 )
+from relay_autotune.scalar import root
 
 _CLOSE = 0.25
 _TAYLOR = 15
@@ -310,9 +311,9 @@ def solutions(
             f"{what} at this gain and dead time; try another structure, or check gain and dead "
             "time"
         )
-    roots = [_root(excess, low, middle)]
-    roots += [_root(excess, middle, high) for high in more if excess(high) > 0.0]
-    found = [lags(*row.shares(root)) for root in roots]
+    shares = [root(excess, low, middle)]
+    shares += [root(excess, middle, high) for high in more if excess(high) > 0.0]
+    found = [lags(*row.shares(share)) for share in shares]
     return [(gain, *(each[i] for i in row.constants)) for each in found]
 
 
@@ -370,10 +371,10 @@ def equal(
     while tau * _STEP < longest:
         before, tau, was, found = tau, tau * _STEP, found, excess(tau * _STEP)
         if found <= 0.0 and (excess(before) if math.isnan(was) else was) > 0.0:
-            root = _root(excess, before, tau)
-            if wave.slope_sign((root,) * order, period, part(root)) > 0.0:
-                relative = wave.peak((root,) * order, period)
-                return (cycle.amplitude / (cycle.relay * relative) if unknown else gain), root
+            fits = root(excess, before, tau)
+            if wave.slope_sign((fits,) * order, period, part(fits)) > 0.0:
+                relative = wave.peak((fits,) * order, period)
+                return (cycle.amplitude / (cycle.relay * relative) if unknown else gain), fits
     raise IdentificationError(
         f"no process of {order} equal lags with a dead time of {cycle.dead_time:g} s "
         + (f"and {ratio:g} tau " if ratio else "")
@@ -416,15 +417,7 @@ def with_amplitude(
         return math.log(wave.peak(lags(attenuation), period) / relative_amplitude)
 
     # The first harmonic of a square wave is 4/pi of it, that of a triangle 8/pi^2.
-    return lags(_root(excess, max(whole - 0.3, 1e-13), max(whole, 0.0) + 0.3))
-
-
-def _root(function: Callable[[float], float], low: float, high: float) -> float:
-    at_low, at_high = function(low), function(high)
-    if at_low * at_high > 0.0:
-        # At the very end of the range of solutions, rounding may put the root outside.
-        return low if abs(at_low) < abs(at_high) else high
-    return float(brentq(function, low, high, xtol=1e-300, rtol=1e-15))
+    return lags(root(excess, max(whole - 0.3, 1e-13), max(whole, 0.0) + 0.3))
 
 
 def _require_possible(cycle: SymmetricCycle, gain: float) -> None:

@@ -33,10 +33,10 @@ from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.limit_cycle.fold import Reading
 from relay_autotune.identification.methods.solved import solved, structure_asked_for
 from relay_autotune.identification.result import FitReport, Identification
-from relay_autotune.minimum import minimum_near
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import INTEGRATOR_INVERSE
 from relay_autotune.record.record import PiecewiseConstant, Record
+from relay_autotune.scalar import minimum_near
 
 _SMALL = 1e-3
 _LARGEST = 1e8

@@ -38,10 +38,10 @@ from scipy.optimize import brentq
 from relay_autotune.errors import ModelError, TuningError
 from relay_autotune.identification.limit_cycle.shape import shape_of_half_cycle
 from relay_autotune.loop.gains import Controller
-from relay_autotune.minimum import minimum_near
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
+from relay_autotune.scalar import minimum_near
 from relay_autotune.tuning.task import DesignTask
 
 

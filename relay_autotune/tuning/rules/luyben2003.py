@@ -39,9 +39,9 @@ from scipy.optimize import brentq
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller, SeriesForm
-from relay_autotune.minimum import minimum_near
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.scalar import minimum_near
 from relay_autotune.tuning.rules.formulas import named, process_of, wants_pid
 from relay_autotune.tuning.task import DesignTask
 
