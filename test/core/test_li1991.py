@@ -68,7 +68,7 @@ def test_two_exact_limit_cycles_give_all_parameters(model, values, epsilon):
 @pytest.mark.parametrize(("model", "values"), CASES[:4], ids=str)
 def test_the_simplest_model_that_agrees_comes_first(model, values):
     tests = _tests(model.build(np.array(values)))
-    fit = fits_jointly(tests, values[-1])[0]
+    fit = fits_jointly(tests, Known(dead_time=values[-1]))[0]
     assert fit.model == model
     assert fit.misfit < 1e-8
 

@@ -30,7 +30,6 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.experiment.settling import ResponseDetector, RestState
-from relay_autotune.identification.estimate import carried
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.limit_cycle.fold import Fold, Reading, fold, level_at_switch
 from relay_autotune.identification.limit_cycle.limit_cycle import (
@@ -64,21 +63,7 @@ _JUMP = 0.6
 _BESIDE = 0.01
 
 
-@dataclass(frozen=True)
-class DeadTime:
-    """Where the dead time of the process comes from.
-
-    :param value: s.
-    :param std: standard deviation of what was read [s]; 0: it was given.
-    :param source: a sentence for the user; empty: it was given.
-    """
-
-    value: float
-    std: float = 0.0
-    source: str = ""
-
-
-def read_dead_time(test: RelayTest, known: Known) -> DeadTime:
+def read_dead_time(test: RelayTest, known: Known) -> tuple[float, float, str]:
     """Return the dead time that is known, or read it from the record.
 
     One lag turns at once when the command arrives, so that the measurement has an edge there in
@@ -87,10 +72,12 @@ def read_dead_time(test: RelayTest, known: Known) -> DeadTime:
 
     :param test: the relay test, with the samples before the kick.
     :param known: a known dead time.
+    :return: the dead time and its standard deviation [s], and a sentence for the user; 0 and
+        empty: it was given.
     :raises IdentificationError: if it is not known and the record does not show it.
     """
     if not math.isnan(known.dead_time):
-        return DeadTime(known.dead_time)
+        return known.dead_time, 0.0, ""
     settings, cycles = test.settings, test.cycle.cycles
     if _is_sharp(fold(test.whole, cycles)):
         edge = Reading.of(test.whole, cycles, lambda seen: np.array([seen.edge]))
@@ -102,7 +89,7 @@ def read_dead_time(test: RelayTest, known: Known) -> DeadTime:
         # An edge lies between two samples, whatever the cycles agree on.
         between = test.record.interval / math.sqrt(12.0 * len(cycles))
         scatter = float(np.nan_to_num(edge.std[0]))
-        return DeadTime(value, max(scatter, between), source)
+        return value, max(scatter, between), source
     first, interval = _first_response(test.whole, settings)
     if math.isnan(first):
         raise IdentificationError(
@@ -114,7 +101,7 @@ def read_dead_time(test: RelayTest, known: Known) -> DeadTime:
         f"the dead time of {value:.4g} s was read from the first response to the kick, which a "
         "slow beginning or noise delays; give it where it is known better"
     )
-    return DeadTime(value, interval / math.sqrt(12.0), source)
+    return value, interval / math.sqrt(12.0), source
 
 
 def _is_sharp(curve: Fold) -> bool:
@@ -236,49 +223,58 @@ ATV = SymmetricMethod("atv", FIRST, 0.1, "eqs 6, 7, 13 and 21 to 25", FIRST)
 
 
 @dataclass(frozen=True)
-class _Seen:
+class Seen:
     """A limit cycle, with the uncertainty of its numbers.
 
-    :param cycle: its numbers; the dead time includes what the relay added.
-    :param dead_time: of the process.
-    :param reading: period, amplitude, level at the switch and dead time.
+    :param reading: period, amplitude, level at the switch and dead time, with what the relay
+        added to it.
+    :param relay: its amplitude [u].
     :param test: the relay test; None: numbers of a chart.
+    :param source: of the dead time, a sentence for the user.
     """
 
-    cycle: SymmetricCycle
-    dead_time: DeadTime
     reading: Reading
+    relay: float
     test: RelayTest | None = None
+    source: str = ""
+
+    @property
+    def cycle(self) -> SymmetricCycle:
+        """The limit cycle."""
+        period, amplitude, level, dead_time = self.reading.values.tolist()
+        return SymmetricCycle(period, amplitude, self.relay, level, dead_time)
+
+    @property
+    def extra_delay(self) -> float:
+        """Dead time that the relay added [s]."""
+        return self.test.settings.extra_delay if self.test else 0.0
 
     def at(self, numbers: FloatArray) -> SymmetricCycle:
         """Return the limit cycle with other numbers."""
         period, amplitude, height, dead_time = numbers.tolist()
-        return replace(
-            self.cycle,
-            period=period,
-            amplitude=amplitude,
-            # The scatter about zero is that of the reading, to both sides.
-            level=min(height, _MOST_LEVEL * amplitude),
-            dead_time=max(dead_time, 0.0),
-        )
+        # The scatter about zero is that of the reading, to both sides.
+        level = min(height, _MOST_LEVEL * amplitude)
+        return SymmetricCycle(period, amplitude, self.relay, level, max(dead_time, 0.0))
 
 
-def measured(seen: Fold) -> FloatArray:
-    """Return period [s], amplitude and level at the switch [y] of an averaged period."""
-    low, high = seen.peaks()
-    return np.array((seen.period, 0.5 * (high - low), level_at_switch(seen), 0.0))
+def seen_in(test: RelayTest, dead_time: float = 0.0, std: float = 0.0, source: str = "") -> Seen:
+    """Return the limit cycle of an unbiased relay test.
 
-
-def symmetric_cycle(numbers: FloatArray, relay: float, dead_time: float) -> SymmetricCycle:
-    """Return the limit cycle of what was measured, whose level may be below zero in noise.
-
-    :param numbers: of :func:`measured`.
-    :param relay: its amplitude [u].
-    :param dead_time: with what the relay added [s].
+    :param test: the relay test.
+    :param dead_time: of the process [s].
+    :param std: its standard deviation [s].
+    :param source: where it comes from, a sentence for the user.
     """
-    period, amplitude, level, _ = numbers.tolist()
-    level = min(max(level, 0.0), _MOST_LEVEL * amplitude)
-    return SymmetricCycle(period, amplitude, relay, level, dead_time)
+
+    def measure(seen: Fold) -> FloatArray:
+        low, high = seen.peaks()
+        return np.array((seen.period, 0.5 * (high - low), level_at_switch(seen), 0.0))
+
+    read = Reading.of(test.whole, test.cycle.cycles, measure)
+    # In noise the level may be below zero, where no relay switches.
+    read.values[2] = min(max(read.values[2], 0.0), _MOST_LEVEL * read.values[1])
+    read = read.with_number(3, dead_time + test.settings.extra_delay, std)
+    return Seen(read, test.settings.amplitude, test, source)
 
 
 def _from_record(
@@ -296,12 +292,7 @@ def _from_record(
     test = relay_test(method.name, record)
     test.require_unbiased()
     test.known_gain(known)
-    dead_time = read_dead_time(test, known)
-    delay = dead_time.value + test.settings.extra_delay
-    read = Reading.of(record, test.cycle.cycles, measured)
-    cycle = symmetric_cycle(read.values, test.settings.amplitude, delay)
-    read = replace(read, values=np.array((cycle.period, cycle.amplitude, cycle.level, 0.0)))
-    seen = _Seen(cycle, dead_time, read.with_number(3, delay, dead_time.std), test)
+    seen = seen_in(test, *read_dead_time(test, known))
     return _identified(method, seen, known, ideal=test.settings.hysteresis == 0.0)
 
 
@@ -314,7 +305,7 @@ def _from_numbers(method: SymmetricMethod, cycle: SymmetricCycle, known: Known) 
     :raises IdentificationError: if no such model has the limit cycle.
     """
     numbers = np.array((cycle.period, cycle.amplitude, cycle.level, cycle.dead_time))
-    seen = _Seen(cycle, DeadTime(cycle.dead_time), Reading(numbers))
+    seen = Seen(Reading(numbers), cycle.relay)
     return _identified(method, seen, known, ideal=cycle.level == 0.0)
 
 
@@ -325,7 +316,7 @@ atv_from_numbers = partial(_from_numbers, ATV)
 
 
 def _identified(
-    method: SymmetricMethod, seen: _Seen, known: Known, *, ideal: bool
+    method: SymmetricMethod, seen: Seen, known: Known, *, ideal: bool
 ) -> Identification:
     gain, cycle, test = abs(known.gain), seen.cycle, seen.test
     sign = test.sign if test else (-1 if known.gain < 0.0 else 1)
@@ -337,14 +328,13 @@ def _identified(
     if test is not None:
         found = sorted(found, key=lambda each: shape_misfit(test, model, cycle, each))
     taken, *others = found
-    delay = cycle.dead_time - seen.dead_time.value
 
     def values(numbers: FloatArray) -> tuple[float, ...]:
         at = seen.at(numbers)
         nearest = min(method.solve(model, at, gain), key=lambda each: _distance(each, taken))
         return *nearest, at.dead_time
 
-    remarks = [seen.dead_time.source, remark, *(test.remarks() if test else ())]
+    remarks = [seen.source, remark, *(test.remarks() if test else ())]
     if model.equal_lags and not math.isnan(gain):
         remarks.append(_disagreement(method, model, cycle, gain))
     remarks += [
@@ -355,7 +345,7 @@ def _identified(
     how = f"{method.paper} for an ideal relay" + (
         ", with the first harmonic of the amplitude," if method.literal is MIXED else ""
     )
-    dead_time = seen.dead_time.value
+    dead_time = cycle.dead_time - seen.extra_delay
     ideally = replace(cycle, level=0.0)
     remarks += literally(
         how,
@@ -372,24 +362,19 @@ def _identified(
     identification = solved(
         *(method.name, model, values, seen.reading),
         sign=sign,
-        extra_delay=delay,
+        extra_delay=seen.extra_delay,
         remarks=remarks,
     )
     if method is not ATV or not ideal:
         return identification
-    scatter, read = (math.nan, math.nan), seen.reading
-    if read.covariance is not None:
-        spread = carried(
-            lambda numbers: np.array(ultimate_estimate(seen.at(numbers))),
-            *(read.values, read.covariance),
-        )
-        scatter = tuple(np.sqrt(np.diag(spread)).tolist())
+    spread = seen.reading.carried(lambda numbers: np.array(ultimate_estimate(seen.at(numbers))))
+    gain_std, frequency_std = np.sqrt(np.diag(spread)).tolist()
     return replace(
         identification,
         ultimate_gain=sign * k_u,
-        ultimate_gain_std=scatter[0],
+        ultimate_gain_std=gain_std,
         ultimate_frequency=w_u,
-        ultimate_frequency_std=scatter[1],
+        ultimate_frequency_std=frequency_std,
     )
 
 
@@ -406,7 +391,7 @@ def _distance(solution: Solution, other: Solution) -> float:
     return sum(abs(math.log(a / b)) for a, b in zip(solution[1:], other[1:], strict=True))
 
 
-def _choice(method: SymmetricMethod, seen: _Seen, gain: float) -> tuple[Structure, str]:
+def _choice(method: SymmetricMethod, seen: Seen, gain: float) -> tuple[Structure, str]:
     """Choose the simplest model that fits, where the gain is known."""
     excesses: dict[int, float] = {}
     # Between two orders of equal lags lies a model with one lag more that differs.
@@ -430,7 +415,7 @@ def _agree(method: SymmetricMethod, order: int, cycle: SymmetricCycle, gain: flo
     return longer <= 0.0 <= shorter
 
 
-def _agrees(method: SymmetricMethod, seen: _Seen, gain: float, order: int, here: float) -> bool:
+def _agrees(method: SymmetricMethod, seen: Seen, gain: float, order: int, here: float) -> bool:
     """Return whether they do within what is uncertain.
 
     That is the scatter of the cycles, and half a sample interval of dead time.
@@ -444,10 +429,8 @@ def _agrees(method: SymmetricMethod, seen: _Seen, gain: float, order: int, here:
 
     half = np.array((0.0, 0.0, 0.0, 0.5 * seen.test.record.interval))
     allowed = [abs(float(excess(read.values + s * half)[0]) - here) for s in (-1.0, 1.0)]
-    if read.covariance is not None:
-        variance = carried(excess, read.values, read.covariance)[0, 0]
-        allowed.append(float(np.nan_to_num(read.quantile * math.sqrt(variance))))
-    return abs(here) <= max(allowed)
+    scatter = float(np.nan_to_num(read.quantile * math.sqrt(read.carried(excess)[0, 0])))
+    return abs(here) <= max(*allowed, scatter)
 
 
 def _disagreement(
@@ -464,7 +447,7 @@ def _disagreement(
     )
 
 
-def _choice_by_shape(method: SymmetricMethod, seen: _Seen, gain: float) -> tuple[Structure, str]:
+def _choice_by_shape(method: SymmetricMethod, seen: Seen, gain: float) -> tuple[Structure, str]:
     """Choose among equal lags by the shape of the half cycles.
 
     Period and amplitude only give gain and time constant then.

@@ -36,9 +36,8 @@ from relay_autotune.identification.limit_cycle.limit_cycle import (
 )
 from relay_autotune.identification.methods.chang import (
     alike,
-    measured,
+    seen_in,
     shape_misfit,
-    symmetric_cycle,
 )
 from relay_autotune.identification.methods.lags import (
     MODEL_1,
@@ -72,6 +71,9 @@ _LEAST_APART = 1e-3
 _LEAST_PERIOD_ERROR = 2e-4
 _LEAST_AMPLITUDE_ERROR = 1e-3
 _SHARE_OF_INTERVAL = 0.3
+
+
+_CHOICE = (MODEL_1, equal_lags(2), equal_lags(3), MODEL_4, MODEL_5)
 
 
 @dataclass(frozen=True)
@@ -163,23 +165,24 @@ def fit_jointly(
 
 def fits_jointly(
     tests: Sequence[SymmetricCycle],
-    dead_time: float = math.nan,
-    *,
+    known: Known,
     errors: Sequence[tuple[float, float]] = (),
     sign: int = 1,
 ) -> list[JointFit]:
-    """Fit models 1 to 5, and return those that agree with all tests, the simplest first.
+    """Fit the structure that is known, or models 1 to 5, and return those that agree.
 
-    If none does, the one that comes nearest.
+    They agree with all tests, the simplest first; if none does, it is the one that comes nearest.
 
-    :param tests: as for :func:`fit_jointly`, as are the others.
+    :param tests: as for :func:`fit_jointly`, as are the last two.
+    :param known: structure, order and dead time where they are known.
     :raises IdentificationError: if no model can be fitted.
     """
     fits: list[JointFit] = []
     refusals: list[IdentificationError] = []
-    for model in (MODEL_1, equal_lags(2), equal_lags(3), MODEL_4, MODEL_5):
+    asked = structure_asked_for(METHOD, known, STRUCTURES)
+    for model in (asked,) if asked else _CHOICE:
         try:
-            fits.append(fit_jointly(model, tests, dead_time, errors=errors, sign=sign))
+            fits.append(fit_jointly(model, tests, known.dead_time, errors=errors, sign=sign))
         except IdentificationError as error:
             refusals.append(error)
     if not fits:
@@ -287,14 +290,11 @@ def identify_li_jointly(records: Sequence[Record], known: Known = NOTHING) -> Id
             "one of the tests had a reverse-acting relay and another did not: they are not of "
             "one process"
         )
-    readings = [Reading.of(test.whole, test.cycle.cycles, measured) for test in tests]
-    cycles = [
-        symmetric_cycle(read.values, test.settings.amplitude, test.settings.extra_delay)
-        for test, read in zip(tests, readings, strict=True)
-    ]
+    seen = [seen_in(test) for test in tests]
+    readings, cycles = [each.reading for each in seen], [each.cycle for each in seen]
     require_difference(cycles)
     errors = [_errors(test, read) for test, read in zip(tests, readings, strict=True)]
-    candidates = _fits(cycles, known, errors, tests[0].sign)
+    candidates = fits_jointly(cycles, known, errors, tests[0].sign)
     away = [_shape_misfit(tests, cycles, candidate) for candidate in candidates]
     fit = next(c for c, a in zip(candidates, away, strict=True) if alike(a, min(away)))
     known_scatter = any(read.covariance is not None for read in readings)
@@ -319,21 +319,9 @@ def li_from_numbers(cycles: Sequence[SymmetricCycle], known: Known) -> Identific
     :param known: dead time, structure and order where they are known.
     :raises IdentificationError: if they do not differ, or no model agrees with them.
     """
-    fit = _fits(cycles, known, (), 1)[0]
+    fit = fits_jointly(cycles, known)[0]
     estimate = Estimate.of(fit.model, fit.values)
     return identified(METHOD, estimate, NORMAL_95, warnings=tuple(_remarks(cycles, known, fit)))
-
-
-def _fits(
-    cycles: Sequence[SymmetricCycle],
-    known: Known,
-    errors: Sequence[tuple[float, float]],
-    sign: int,
-) -> list[JointFit]:
-    model = structure_asked_for(METHOD, known, STRUCTURES)
-    if model is None:
-        return fits_jointly(cycles, known.dead_time, errors=errors, sign=sign)
-    return [fit_jointly(model, cycles, known.dead_time, errors=errors, sign=sign)]
 
 
 def _shape_misfit(

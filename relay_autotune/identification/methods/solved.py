@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.estimate import Estimate, carried, jacobian
+from relay_autotune.identification.estimate import Estimate, jacobian
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.limit_cycle.fold import Reading
 from relay_autotune.identification.result import Identification, identified
@@ -237,10 +237,7 @@ def solved(
         found[-1] = max(found[-1] - extra_delay, 0.0)
         return found
 
-    best, covariance = values(reading.values), None
-    if reading.covariance is not None:
-        covariance = carried(values, reading.values, reading.covariance)
-    estimate = Estimate.of(structure, best, covariance)
+    estimate = Estimate(structure, values(reading.values), reading.carried(values))
     warnings = tuple(r for r in remarks if r)
     return identified(method, estimate, reading.quantile, warnings=warnings)
 
