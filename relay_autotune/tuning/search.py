@@ -50,6 +50,8 @@ _POINTS = 512
 _RESETS, _TURNS = 6.0, 5.0
 # Length of a sampled load response in ultimate periods, and range of its number of samples.
 _PERIODS, _LEAST_SAMPLES, _MOST_SAMPLES = 32.0, 256, 2048
+# Largest phase of the filter below the grid of frequencies [rad].
+_TURNED = 0.1
 # Samples in an ultimate period above which its cost is as good as that of the continuous loop.
 _FAST = 25.0
 
@@ -579,8 +581,10 @@ class Search:
         return upper, lower
 
     def _filters(self, kp: FloatArray, td: FloatArray) -> FloatArray:
-        """Return the filter that each controller needs [s], shape (k,)."""
-        return filters_of(self.rate, td, self.noise / kp, self.filter_ratio)
+        """Return the filter that each controller needs [s], shape (k,); infinite: none will do."""
+        found = filters_of(self.rate, td, self.noise / kp, self.filter_ratio)
+        # A slower one turns the loop below the frequencies that are looked at.
+        return np.where(found * self.responses.grid[0] <= _TURNED, found, math.inf)
 
     def _iaes(self, c: Candidates) -> FloatArray:
         """Return the IAE of a unit step of the load for each controller [y s/u]."""

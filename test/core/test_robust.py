@@ -226,6 +226,18 @@ def test_gains_carry_what_the_user_must_know():
     assert gains.noise_gain >= gains.kc
 
 
+@pytest.mark.parametrize("period", [1.8, 2.0])
+def test_a_filter_is_not_so_slow_that_it_turns_the_loop_below_the_frequencies_looked_at(period):
+    # A lag 200 times the dead time, sampled as slowly as that, with noise in every sample.
+    process = TransferFunction.fopdt(0.5485, 426.3, 1.867)
+    options = DesignOptions(sample_period=period, noise_std=2.28, amplitude=50.0)
+    gains = design(DesignTask(model=process, options=options), "robust")
+    assert gains.ms <= 1.41
+    assert gains.ti > 10.0 * period
+    # About as loud as allowed, not as quiet as with a filter of hours.
+    assert gains.noise_gain > 0.9 * 0.1 * 50.0 / 2.28
+
+
 def test_gains_that_no_filter_makes_quiet_enough_are_no_candidates():
     process = TransferFunction.fopdt(1.0, 10.0, 1.0)
     search = Search(process, (), 10.0, 1e-6, LawRate(LAWS[OWN_LAW], 1.0))
