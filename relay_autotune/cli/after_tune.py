@@ -57,6 +57,7 @@ from relay_autotune.cli.tune_view import (
     result_lines,
     wants_colour,
 )
+from relay_autotune.control.controller import Control
 from relay_autotune.control.verification import Step, allowed_steps, noise_of, plan, proving_step
 from relay_autotune.errors import RelayAutotuneError, SelectionError, TuningError
 from relay_autotune.exchange.export import (
@@ -75,7 +76,7 @@ from relay_autotune.loop.gains import Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes.gains_client import GainsClient
 from relay_autotune.nodes.live_types import FLOAT64
-from relay_autotune.nodes.tables import FIXED, GAINS, parameters_of_law, rate_from
+from relay_autotune.nodes.tables import FIXED, GAINS, parameters_of_law, rate_of
 from relay_autotune.reasons import Code
 from relay_autotune.record.record import Record
 from relay_autotune.text import digits, duration
@@ -110,13 +111,13 @@ class Proof:
         step = options.step or proving_step(record, model, *limits, noise)
         if not step:
             raise TuningError("the limits leave no room for a step: widen --within")
-        self.rate = rate_from(parameters_of_law(gains.law, gains.law_period))
-        period, rate = record.mean_interval, self.rate
-        once = plan(gains, model, Step(setpoint=1.0), period, rate=rate)
+        self.rate = rate_of(gains.law, gains.law_period)
+        control, period = Control(gains, self.rate), record.mean_interval
+        once = plan(control, model, Step(setpoint=1.0), period)
         self.allowed = allowed_steps(record, model, *limits, once, noise)
         self.step: float = options.step or self.allowed.nearest(step)
         self.allowed.require(self.step)
-        wanted = plan(gains, model, Step(setpoint=self.step), period, rate=rate)
+        wanted = plan(control, model, Step(setpoint=self.step), period)
         # How long the loop takes to settle with the gains, and all of it [s].
         known = math.isfinite(gains.settling_time)
         self._settles = gains.settling_time if known else wanted.duration

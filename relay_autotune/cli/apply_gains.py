@@ -217,9 +217,6 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
         except LoopError as error:
             told = f"not known: {error}; before the proof: {_numbers(present)}"
             entries = [*found_entries(result, noise), ("gains in force", told)]
-        if result.steps and gains.law and client.values(client.name, ["apply_to"])["apply_to"]:
-            told = f"by controller_node's own law; the tune's figures are for {gains.law}"
-            entries.insert(-1, ("predicted", f"{told} every {gains.law_period:g} s"))
         for entry in entries:
             tell(*entry)
     return result.passed, "" if result.passed else result.reason

@@ -27,7 +27,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import LawRate, RunningLaw
+from relay_autotune.loop.laws import LawRate, RunningLaw, SampledLaw
 from relay_autotune.loop.sampled import UNLIMITED, ClosedLoop, Limits, PidLaw, filter_matrices
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
@@ -261,37 +261,67 @@ def running(rate: LawRate | None, *args: Any, **others: Any) -> PidController:
     return LawController(rate, *args, **others)
 
 
+@dataclass(frozen=True)
+class Control:
+    """Gains, and what runs them.
+
+    :param gains: the controller.
+    :param rate: the law that runs them, and how often; None: our own, at each sample.
+    :param elsewhere: True: another program runs the law, by its own clock; False: the node that
+        takes the samples runs it, at those next to its runs.
+    """
+
+    gains: Controller
+    rate: LawRate | None = None
+    elsewhere: bool = False
+
+    @property
+    def law(self) -> Controller | SampledLaw:
+        """The law with the gains.
+
+        :raises TuningError: if it cannot run them.
+        """
+        return self.gains if self.rate is None else self.rate.of(self.gains)
+
+
 def run_loop(
-    gains: Controller,
+    control: Control,
     model: TransferFunction,
     time: FloatArray,
     *,
     setpoint: float = 0.0,
     load: float = 0.0,
     limits: Limits = UNLIMITED,
-    rate: LawRate | None = None,
 ) -> ClosedLoop:
-    """Simulate the controller on the exact process, from rest, after steps of set-point and load.
+    """Simulate a controller on the exact process, from rest, after steps of set-point and load.
 
-    :param gains: the controller.
+    :param control: the controller.
     :param model: the process.
     :param time: instants of the samples [s], increasing, the first at the step, shape (n,).
     :param setpoint: step of the set-point [y].
     :param load: step added to the command [u].
     :param limits: range of the command, as deviations [u].
-    :param rate: the law, and how often it runs; None: our own, at each sample.
     """
-    plant = Plant(model)
-    controller = running(rate, gains, 0.0, limits=limits)
+    plant, samples = Plant(model), time - time[0]
+    controller = running(control.rate, control.gains, 0.0, limits=limits)
     interval = float(np.median(np.diff(time))) if time.size > 1 else 1.0
+    runs, until = samples, np.arange(1, time.size + 1)
+    if control.elsewhere and control.rate is not None:
+        # Its runs go on where a sample is lost, and between the samples of a slow sensor.
+        interval = control.rate.period
+        runs = interval * np.arange(int(samples[-1] / interval) + 1)
+        until = np.searchsorted(runs, samples, side="right")
     controller.step(-interval, 0.0, 0.0)
     measurement, command = np.empty(time.size), np.empty(time.size)
-    applied = 0.0
-    for k, t in enumerate(time - time[0]):
-        y = plant.advance(float(t), applied)
-        u = controller.step(float(t), setpoint, y)
-        applied = u + load
-        measurement[k], command[k] = y, u
+    done, applied, y = 0, 0.0, 0.0
+    for k, t in enumerate(samples):
+        for run in runs[done : until[k]]:
+            y = plant.advance(float(run), applied)
+            applied = controller.step(float(run), setpoint, y) + load
+        done = until[k]
+        if runs[done - 1] != t:
+            y = plant.advance(float(t), applied)
+        measurement[k], command[k] = y, controller.command
     return ClosedLoop(time, measurement, command)
 
 

@@ -13,11 +13,9 @@ from scipy.optimize import minimize_scalar
 from scipy.special import ndtr
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.control.controller import run_loop, scaled
+from relay_autotune.control.controller import Control, run_loop, scaled
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop
-from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import LawRate
 from relay_autotune.loop.sampled import UNLIMITED, Limits
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code, Reason
@@ -314,40 +312,40 @@ def rounded_up(value: float) -> float:
 
 
 def plan(
-    gains: Controller,
+    control: Control,
     model: TransferFunction,
     step: Step,
     period: float,
     noise_std: float = 0.0,
-    rate: LawRate | None = None,
 ) -> Plan:
     """Return how long a step must be observed, and when to stop it.
 
-    :param gains: the controller.
+    :param control: the controller.
     :param model: the process.
     :param step: the step.
     :param period: sample period of the loop [s].
     :param noise_std: standard deviation of the measurement noise [y].
-    :param rate: the law that runs the gains; None: our own.
     :raises TuningError: if the loop is unstable on the model, does not settle, or has fewer
-        samples than the law has runs.
+        samples than the law that they run.
     """
+    # Another program does not wait for the samples.
+    rate = None if control.elsewhere else control.rate
     if rate is not None and period > _SLOWER_SENSOR * rate.period:
         raise TuningError(
             f"the samples come every {period:.3g} s, and {rate.law.name} runs every "
             f"{rate.period:.3g} s: these gains can only be proven in their own program; design "
             f"them for the sensor, with a sampling period of {period:.3g} s"
         )
-    if not runs_stably(gains, model, rate):
+    if not runs_stably(control, model):
         raise TuningError("these gains make an unstable loop with the model: nothing to verify")
-    horizon = max(8.0 * (gains.ti + model.dead_time), LEAST_SAMPLES * period)
+    horizon = max(8.0 * (control.gains.ti + model.dead_time), LEAST_SAMPLES * period)
     for _ in range(_DOUBLINGS):
         # Predict a slow loop with fewer samples, to save time.
         interval = max(period, horizon / _PREDICTED_SAMPLES)
         if rate is not None:
             interval = max(period, min(interval, rate.period))
         time = np.arange(int(horizon / interval) + 2, dtype=np.float64) * interval
-        run = run_loop(gains, model, time, setpoint=step.setpoint, load=step.load, rate=rate)
+        run = run_loop(control, model, time, setpoint=step.setpoint, load=step.load)
         response = describe(time, run.measurement, step)
         if response.settling_time < 0.6 * horizon:
             duration = max(WATCHED * response.settling_time, LEAST_SAMPLES * period)
@@ -355,20 +353,19 @@ def plan(
             low, high, last = run.command.min(), run.command.max(), run.command[-1]
             command = float(min(low, last - high, 0.0)), float(max(high, last - low, 0.0))
             watched = time[time <= duration]
-            visible = _visible(gains, model, step, watched, period, run.measurement, rate)
+            visible = _visible(control, model, step, watched, period, run.measurement)
             return Plan(duration, runaway, response.largest, command, visible)
         horizon *= 2.0
     raise TuningError("the predicted response does not settle in any reasonable time")
 
 
 def _visible(
-    gains: Controller,
+    control: Control,
     model: TransferFunction,
     step: Step,
     time: FloatArray,
     period: float,
     predicted: FloatArray,
-    rate: LawRate | None,
 ) -> float:
     """Return the least height of a step with noise of standard deviation 1 [y, of a load u].
 
@@ -378,19 +375,18 @@ def _visible(
     should have settled; that the sum of absolute errors, or the fitted gain, is beyond its limit,
     to which also belongs the gain that makes Ms too large.
 
-    :param gains: the controller.
+    :param control: the controller.
     :param model: the process.
     :param step: the step.
     :param time: instants of the prediction until the end of the step [s], shape (n,).
     :param period: sample period of the loop [s].
     :param predicted: deviation of the measurement [y], at these instants at least.
-    :param rate: the law that runs the gains; None: our own.
     """
     deviation = predicted[: time.size]
     expected = describe(time, deviation, step)
     scale = abs(step.setpoint) or expected.largest
     other = run_loop(
-        gains, scaled(model, _SLIGHTLY), time, setpoint=step.setpoint, load=step.load, rate=rate
+        control, scaled(model, _SLIGHTLY), time, setpoint=step.setpoint, load=step.load
     ).measurement
     slope = float(np.sum(((other - deviation) / math.log(_SLIGHTLY) / scale) ** 2))
     interval = float(np.median(np.diff(time)))
@@ -404,7 +400,7 @@ def _visible(
         beyond = side * error
     limit = SETTLING_RATIO * expected.settling_time + 2.0 * period
     late = (time + interval > limit) | (time >= time[-1] - interval)
-    edges = [_edge(gains, model, math.log(end), rate) for end in GAIN_RANGE]
+    edges = [_edge(control, model, math.log(end)) for end in GAIN_RANGE]
     nodes, weights = np.polynomial.hermite_e.hermegauss(_NODES)
     weights = weights / weights.sum()
     floor = math.sqrt(2.0 / math.pi)
@@ -434,18 +430,17 @@ def _visible(
     return height / (scale * math.exp(low))
 
 
-def _edge(gains: Controller, model: TransferFunction, end: float, rate: LawRate | None) -> float:
+def _edge(control: Control, model: TransferFunction, end: float) -> float:
     """Return how far the logarithm of the process gain may go to an end until Ms is too large.
 
-    :param gains: the controller.
+    :param control: the controller.
     :param model: the process.
     :param end: where the gain is itself too far from the model's.
-    :param rate: the law that runs the gains; None: our own.
     """
-    most = MS_RATIO * _ms(gains, model, rate)
+    most = MS_RATIO * _ms(control, model)
 
     def is_within(part: float) -> bool:
-        return _ms(gains, scaled(model, math.exp(part * end)), rate) <= most
+        return _ms(control, scaled(model, math.exp(part * end))) <= most
 
     low, high = 0.0, 1.0
     if is_within(high):
@@ -490,7 +485,7 @@ def describe(
 
 
 def compare(
-    gains: Controller,
+    control: Control,
     model: TransferFunction,
     step: Step,
     time: FloatArray,
@@ -498,29 +493,26 @@ def compare(
     *,
     limits: Limits = UNLIMITED,
     noise_std: float = 0.0,
-    rate: LawRate | None = None,
 ) -> Comparison:
     """Compare a measured step with the prediction.
 
-    :param gains: the controller.
+    :param control: the controller.
     :param model: the process as identified.
     :param step: the step.
     :param time: instants of the samples, the first at the step [s], shape (n,).
     :param deviation: measurement minus its value before the step [y], shape (n,).
     :param limits: range of the command, relative to its value before the step [u].
     :param noise_std: standard deviation of the measurement noise [y].
-    :param rate: the law that runs the gains; None: our own.
     """
 
     def predict(factor: float) -> FloatArray:
         run = run_loop(
-            gains,
+            control,
             scaled(model, factor),
             time,
             setpoint=step.setpoint,
             load=step.load,
             limits=limits,
-            rate=rate,
         )
         return run.measurement
 
@@ -536,7 +528,7 @@ def compare(
     rms = math.sqrt(float(np.mean((deviation - predicted) ** 2)))
     measured = describe(time, deviation, step, noise_std)
     expected = describe(time, predicted, step)
-    ms, ms_predicted = _ms(gains, scaled(model, ratio), rate), _ms(gains, model, rate)
+    ms, ms_predicted = _ms(control, scaled(model, ratio)), _ms(control, model)
     compared = _comparisons(measured, expected, ratio, ms, ms_predicted, time)
     # Written so that NaN does not pass.
     problems = [c.problem for c in compared if not c.taken <= 1.0]
@@ -565,23 +557,18 @@ def compare(
     )
 
 
-def runs_stably(gains: Controller, model: TransferFunction, rate: LawRate | None) -> bool:
+def runs_stably(control: Control, model: TransferFunction) -> bool:
     """Return whether the closed loop is stable.
 
-    :param gains: the controller.
+    :param control: the controller.
     :param model: the process.
-    :param rate: the law that runs the gains; None: our own.
     :raises TuningError: if the law cannot run them.
     """
-    return _loop(gains, model, rate).unstable_poles == 0
+    return Loop(control.law, model).unstable_poles == 0
 
 
-def _loop(gains: Controller, model: TransferFunction, rate: LawRate | None) -> Loop:
-    return Loop(gains if rate is None else rate.of(gains), model)
-
-
-def _ms(gains: Controller, model: TransferFunction, rate: LawRate | None) -> float:
-    ms = _loop(gains, model, rate).ms()
+def _ms(control: Control, model: TransferFunction) -> float:
+    ms = Loop(control.law, model).ms()
     return ms if math.isfinite(ms) else math.nan
 
 

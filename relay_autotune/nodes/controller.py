@@ -119,7 +119,7 @@ class ControllerNode(ServedNode):
         self._rate = tables.rate_from(values)
         self._settings = tables.settings_from(values, self._rate)
         gains = self._settings.gains
-        self._results = ResultCheck(self, lambda c, model: runs_stably(c, model, self._rate))
+        self._results = ResultCheck(self, lambda c, m: runs_stably(self._place.control(c), m))
         # The gains that wait to be applied, with the id of their experiment.
         self._pending: tuple[str, Gains] | None = None
         # Why those that came since were refused; empty: none were.
@@ -495,8 +495,8 @@ class ControllerNode(ServedNode):
         if doubt and not self.get_parameter("accept_doubtful").value:
             raise NotReadyError(Code.DOUBTFUL_MODEL(doubt=doubt))
         steps, limits = self._steps_of(request), self._settings.limits
-        controller = self._place.controller_of(kept)
-        return Verifiable(steps, new, settles, controller, model, limits, self._rate)
+        control = self._place.control(self._place.controller_of(kept))
+        return Verifiable(steps, new, settles, control, model, limits)
 
     def _steps_of(self, request: Verify.Goal) -> list[Step]:
         height = request.setpoint_step or self.get_parameter("verify_step").value

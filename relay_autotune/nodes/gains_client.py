@@ -17,6 +17,7 @@ from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
 from relay_autotune.control import verification
+from relay_autotune.control.controller import Control
 from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import (
     gains_from_message,
@@ -28,9 +29,9 @@ from relay_autotune.exchange.messages import (
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.gains_place import controller_of, mapping_of
+from relay_autotune.nodes.gains_place import controller_of, in_another_node, mapping_of
 from relay_autotune.nodes.loop_client import ANSWER_WITHIN, GoneError, LoopClient
-from relay_autotune.nodes.tables import FIXED, GAINS, rate_from
+from relay_autotune.nodes.tables import FIXED, GAINS, rate_from, rate_of
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import may_pass
 from relay_autotune.record.record import Record
@@ -250,13 +251,18 @@ class GainsClient(LoopClient):
         record = self._record()
         if record is None:
             return verification.StepRange()
-        names = ("law", "law_period", "apply_to")
-        rate = rate_from(self.values(self.name, names))
-        model = self.model()
-        wanted = verification.plan(
-            gains, model, verification.Step(setpoint=1.0), record.mean_interval, rate=rate
-        )
+        model, step = self.model(), verification.Step(setpoint=1.0)
+        wanted = verification.plan(self._control(gains), model, step, record.mean_interval)
         return verification.allowed_steps(record, model, *self._limits(), wanted, self.noise())
+
+    def _control(self, gains: Controller) -> Control:
+        """Return gains as they run in the node that controls."""
+        values = self.values(self.name, ("law", "law_period", "apply_to", "apply_feedforward"))
+        if not values["apply_to"]:
+            return Control(gains, rate_from(values))
+        newest, _ = self.waiting()
+        rate = rate_of(newest.law, newest.law_period)
+        return in_another_node(gains, rate, values["apply_feedforward"])
 
     def _limits(self) -> tuple[Limits, Limits]:
         """Return the ranges of measurement and command."""

@@ -12,6 +12,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
@@ -20,7 +21,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 
-from relay_autotune.control.controller import is_usable
+from relay_autotune.control.controller import Control, is_usable
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.errors import FieldError, LoopError, NotReadyError, ParameterError, TuningError
 from relay_autotune.loop.gains import Controller, Gains
@@ -28,7 +29,13 @@ from relay_autotune.loop.laws import LAWS, LawRate
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.nodes.live_types import CommandMessage, reader_of
-from relay_autotune.nodes.tables import GAINS, MESSAGE_PARAMETERS, OWN_LAWS, parameters_of_law
+from relay_autotune.nodes.tables import (
+    GAINS,
+    MESSAGE_PARAMETERS,
+    OWN_LAWS,
+    parameters_of_law,
+    rate_of,
+)
 from relay_autotune.reasons import Code, Reason
 
 # Names of the gains that may be sent, of the ISA and of the parallel form, and the time constant
@@ -59,12 +66,10 @@ def mapping_of(text: str) -> dict[str, str]:
     return found
 
 
-def controller_of(gains: Mapping[str, float], feedforward: float = 0.0) -> Controller:
+def controller_of(gains: Mapping[str, float]) -> Controller:
     """Return the controller with gains given by name, in the ISA or the parallel form.
 
     :param gains: some of `NAMES`; defaults: no derivative, no filter, set-point weight 1.
-    :param feedforward: gain from the set-point to the command, beside these gains [u/y]; with
-        ``kc (b r - y)`` it is a set-point weight ``b + feedforward/kc``.
     :raises RelayAutotuneError: if they are not enough for a controller.
     """
     proportional = gains.get("kc", gains.get("p"))
@@ -79,8 +84,22 @@ def controller_of(gains: Mapping[str, float], feedforward: float = 0.0) -> Contr
         gains.get("ti", proportional / integral if integral else 0.0),
         gains.get("td", derivative / proportional if proportional else 0.0),
         gains.get("tf", 0.0),
-        gains.get("b", 1.0) + (feedforward / proportional if proportional else 0.0),
+        gains.get("b", 1.0),
     )
+
+
+def in_another_node(gains: Controller, rate: LawRate | None, feedforward: float) -> Control:
+    """Return gains as another node runs them.
+
+    :param gains: the gains.
+    :param rate: its law; None: not known, our own stands for it.
+    :param feedforward: its gain from the set-point to the command beside these [u/y]; with
+        ``kc (b r - y)`` it is a set-point weight ``b + feedforward/kc``, which no law has.
+    """
+    if rate is not None:
+        rate = replace(rate, law=replace(rate.law, weights=()))
+    weighted = replace(gains, b=gains.b + feedforward / gains.kc)
+    return Control(weighted, rate, elsewhere=True)
 
 
 class Place(ABC):
@@ -88,16 +107,16 @@ class Place(ABC):
 
     :param name: of the controlling node, for people.
     :param mapping: its parameter name for each gain.
-    :param feedforward: its gain from the set-point to the command beside these [u/y].
+    :param rate: the law that it runs; None: that of controller_node.
     """
 
     outlives = False
     """True if the gains stay in force when this process ends."""
 
-    def __init__(self, name: str, mapping: Mapping[str, str], feedforward: float = 0.0) -> None:
+    def __init__(self, name: str, mapping: Mapping[str, str], rate: LawRate | None) -> None:
         self.name = name
         self._mapping = dict(mapping)
-        self._feedforward = feedforward
+        self._rate = rate
 
     def set_of(self, controller: Controller) -> GainSet:
         """Return the parameters of a controller.
@@ -115,8 +134,14 @@ class Place(ABC):
         values, names = gains.by_name(), set(self._mapping.values())
         if values.keys() != names:
             raise LoopError(f"{self.name} has the gains {', '.join(sorted(names))}")
-        named = {name: values[target] for name, target in self._mapping.items()}
-        return controller_of(named, self._feedforward)
+        return controller_of({name: values[t] for name, t in self._mapping.items()})
+
+    def control(self, gains: Controller) -> Control:
+        """Return gains as they run there.
+
+        :param gains: the gains.
+        """
+        return Control(gains, self._rate)
 
     @abstractmethod
     def require_law(self, gains: Gains) -> None:
@@ -153,9 +178,8 @@ class OwnGains(Place):
     """
 
     def __init__(self, use: Callable[[GainSet | None], None], rate: LawRate | None) -> None:
-        super().__init__("this node", {entry.name: entry.name for entry in GAINS})
+        super().__init__("this node", {entry.name: entry.name for entry in GAINS}, rate)
         self._use = use
-        self._rate = rate
 
     def require_law(self, gains: Gains) -> None:
         """Refuse gains for another law than that of this node."""
@@ -220,8 +244,9 @@ class RemoteGains(Place):
     def __init__(
         self, node: Node, target: str, mapping: Mapping[str, str], feedforward: float
     ) -> None:
-        super().__init__(target, mapping, feedforward)
-        self._node = node
+        # Its law is known with the first gains that are for it.
+        super().__init__(target, mapping, None)
+        self._node, self._feedforward = node, feedforward
         base = target.rstrip("/")
         # Answers must be handled while the callback that waits for them is still running.
         self._group = ReentrantCallbackGroup()
@@ -233,6 +258,10 @@ class RemoteGains(Place):
             )
         )
 
+    def control(self, gains: Controller) -> Control:
+        """Return gains as the other node runs them, by the law of the newest gains for it."""
+        return in_another_node(gains, self._rate, self._feedforward)
+
     def require_law(self, gains: Gains) -> None:
         """Refuse gains for a program whose parameters are not the gains themselves."""
         if gains.law and not LAWS[gains.law].sets_gains:
@@ -240,6 +269,7 @@ class RemoteGains(Place):
                 f"they are for the law {gains.law}, which {self.name} does not run: write them "
                 f"to a file with apply_gains --file, or tune without that law"
             )
+        self._rate = rate_of(gains.law, gains.law_period)
 
     def said(self, gains: GainSet | None) -> str:
         """Say which gains are in force."""

@@ -276,23 +276,30 @@ def settings_from(values: Mapping[str, Any], rate: LawRate | None) -> Settings:
 def rate_from(values: Mapping[str, Any]) -> LawRate | None:
     """Return the law that the node runs, None if it is its own.
 
-    :param values: the parameters by name, at least those of `parameters_of_law`.
+    :param values: the parameters by name: law, law_period and apply_to.
     :raises ParameterError: if its period is not given, or another node has the gains.
     """
-    law = values.get("law", "")
-    if law in OWN_LAWS:
-        return None
-    period = values["law_period"]
-    if values.get("apply_to"):
+    law, period = values["law"], values["law_period"]
+    is_own = law in OWN_LAWS
+    if values["apply_to"] and not is_own:
         raise ParameterError(
             f"law is {law}, which this node would run itself, and apply_to is "
             f"{values['apply_to']}, which runs its own: give only one of them"
         )
-    if period == 0.0:
+    if period == 0.0 and not is_own:
         raise ParameterError(
             f"law is {law} and law_period is 0 s: give the time between two runs of its program"
         )
-    return LawRate(LAWS[law], period)
+    return rate_of(law, period)
+
+
+def rate_of(law: str, period: float) -> LawRate | None:
+    """Return a law and how often it runs, None for that of controller_node.
+
+    :param law: its name.
+    :param period: of its runs [s].
+    """
+    return None if law in OWN_LAWS else LawRate(LAWS[law], period)
 
 
 def parameters_of_law(law: str, period: float) -> dict[str, Any]:

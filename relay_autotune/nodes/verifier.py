@@ -17,14 +17,12 @@ from typing import Any
 import numpy as np
 from rclpy.task import Future
 
-from relay_autotune.control.controller import LONGEST_TIME
+from relay_autotune.control.controller import LONGEST_TIME, Control
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import Plan, Step, compare, plan
 from relay_autotune.errors import NotReadyError, RelayAutotuneError
 from relay_autotune.exchange.fields import float64_array
 from relay_autotune.exchange.messages import fill_reason, reason_from_message, set_stamp
-from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import LawRate
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.goals import Narrator, OneGoal, conclude
@@ -65,19 +63,17 @@ class Verifiable:
     :param steps: to be made.
     :param new: the gains that are put in force for it; None: those in force are tried.
     :param settles: how long the loop takes to settle with new gains [s]; NaN: not known.
-    :param gains: the controller to be tried.
+    :param control: the controller to be tried.
     :param model: the process as identified.
     :param limits: range of the command.
-    :param rate: the law that runs them; None: our own.
     """
 
     steps: Sequence[Step]
     new: GainSet | None
     settles: float
-    gains: Controller
+    control: Control
     model: TransferFunction
     limits: Limits
-    rate: LawRate | None
 
 
 class Predictors:
@@ -270,9 +266,9 @@ class Verifier:
         rest, period = await self._rested(tried.steps, until)
         if not self._is_preparing():
             return
-        loop = tried.gains, tried.model
+        loop = tried.control, tried.model
         plans = await self._node.computed(
-            lambda: [plan(*loop, s, period, rest.noise_std, tried.rate) for s in tried.steps]
+            lambda: [plan(*loop, s, period, rest.noise_std) for s in tried.steps]
         )
         for step, planned in zip(tried.steps, plans, strict=True):
             planned.require_visible(step, rest.noise_std)
@@ -540,14 +536,13 @@ def judged(
     planned.require_visible(step, float(np.diff(levels).min()) / math.sqrt(12.0))
     limits = tried.limits
     found = compare(
-        tried.gains,
+        tried.control,
         tried.model,
         step,
         t - t[0],
         y - rest.measurement,
         limits=Limits(limits.low - rest.command, limits.high - rest.command),
         noise_std=rest.noise_std,
-        rate=tried.rate,
     )
     message = Verification(
         kind=Verification.SETPOINT if step.setpoint else Verification.LOAD,

@@ -9,7 +9,6 @@ import math
 import os
 import signal
 import sys
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -185,24 +184,6 @@ def test_ctrl_c_in_a_proof_ends_it_and_the_last_line_says_what_is_in_force(
     with pytest.raises(KeyboardInterrupt):
         apply_gains.apply_and_verify(client_of(prove, lambda: None), given)
     assert capsys.readouterr().err.endswith("cancelled; kc 0.1 in force again\n")
-
-
-def test_a_prediction_by_another_law_than_that_of_the_design_is_told_as_such(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """For one joint the tune told an overshoot of 24 %, and its proof of 28 %, without a word."""
-    found = Verify.Result(passed=True, steps=[step()])
-    for_law = replace(GAINS, law="control_toolbox_legacy", law_period=0.01)
-    for target, told in (("", 0), ("/pid", 1)):
-        client = client_of(lambda *words: found, lambda: None)
-        client.waiting = lambda: (for_law, "")
-        client.values = lambda node, names, to=target: {"apply_to": to}
-        given = apply_gains._parser().parse_args(["--yes", "--step", "0.5"])
-        assert apply_gains.apply_and_verify(client, given) == (True, "")
-        shown = " ".join(capsys.readouterr().out.split())
-        before, _, last = shown.rpartition("gains in force")
-        assert before.count("are for control_toolbox_legacy every 0.01 s") == told
-        assert last.startswith(" none, the command is held")
 
 
 def test_new_gains_that_could_not_be_taken_back_are_told_as_such(

@@ -13,7 +13,7 @@ import pytest
 from fopdt_plant import FopdtPlant
 from scipy.integrate import solve_ivp
 
-from relay_autotune.control.controller import GainBounds, PidController, run_loop
+from relay_autotune.control.controller import Control, GainBounds, PidController, run_loop
 from relay_autotune.control.verification import (
     Step,
     StepRange,
@@ -139,8 +139,8 @@ def test_jitter_changes_little():
     steady = np.arange(400) * 0.05
     shaken = steady + np.append(0.0, rng.uniform(0.0, 0.02, 399))
     gains = Controller(kc=1.2, ti=2.0, td=0.1, tf=0.05)
-    exact = run_loop(gains, PROCESS, steady, setpoint=1.0)
-    other = run_loop(gains, PROCESS, shaken, setpoint=1.0)
+    exact = run_loop(Control(gains), PROCESS, steady, setpoint=1.0)
+    other = run_loop(Control(gains), PROCESS, shaken, setpoint=1.0)
     at = np.interp(steady, shaken, other.measurement)
     assert np.abs(at - exact.measurement).max() < 0.03
 
@@ -149,9 +149,9 @@ def test_jitter_changes_little():
 
 
 def measured(process, step, noise_std=0.0, gains=GAINS, period=0.05):
-    wanted = plan(gains, PROCESS, step, period, noise_std)
+    wanted = plan(Control(gains), PROCESS, step, period, noise_std)
     time = np.arange(int(wanted.duration / period)) * period
-    run = run_loop(gains, process, time, setpoint=step.setpoint, load=step.load)
+    run = run_loop(Control(gains), process, time, setpoint=step.setpoint, load=step.load)
     noise = noise_std * np.random.default_rng(4).standard_normal(time.size)
     return time, run.measurement + noise
 
@@ -161,7 +161,7 @@ def measured(process, step, noise_std=0.0, gains=GAINS, period=0.05):
 @pytest.mark.parametrize("noise_std", [0.0, 0.01])
 def test_the_process_itself_passes(step, noise_std):
     time, y = measured(PROCESS, step, noise_std)
-    found = compare(GAINS, PROCESS, step, time, y, noise_std=noise_std)
+    found = compare(Control(GAINS), PROCESS, step, time, y, noise_std=noise_std)
     assert found.passed, found.reason
     assert found.gain_ratio == pytest.approx(1.0, abs=0.05)
     assert found.fit > 0.8
@@ -172,7 +172,7 @@ def test_the_process_itself_passes(step, noise_std):
 @pytest.mark.parametrize("factor", [0.4, 2.2])
 def test_a_process_of_another_gain_fails_with_its_ratio(step, factor):
     time, y = measured(replace(PROCESS, gain=factor * PROCESS.gain), step)
-    found = compare(GAINS, PROCESS, step, time, y)
+    found = compare(Control(GAINS), PROCESS, step, time, y)
     assert not found.passed
     assert found.gain_ratio == pytest.approx(factor, rel=0.05)
     assert "another gain than the model" in found.reason
@@ -183,12 +183,12 @@ def test_a_process_of_another_gain_fails_with_its_ratio(step, factor):
 @pytest.mark.parametrize(("factor", "step"), [(0.64, Step(load=0.4)), (1.5, Step(setpoint=0.5))])
 def test_what_is_close_to_its_limit_passes_narrowly_with_the_limit(factor, step):
     other = replace(PROCESS, gain=factor * PROCESS.gain)
-    found = compare(GAINS, PROCESS, step, *measured(other, step))
+    found = compare(Control(GAINS), PROCESS, step, *measured(other, step))
     assert found.passed
     assert found.why.code is Code.NARROWLY
     near = f"the gain is {factor:.2f} times the model's, 0.6 to 1.7 passes"
     assert near in str(found.why["narrow"])
-    same = compare(GAINS, PROCESS, step, *measured(PROCESS, step))
+    same = compare(Control(GAINS), PROCESS, step, *measured(PROCESS, step))
     assert same.why.code is Code.AS_PREDICTED
 
 
@@ -228,7 +228,7 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
         settings=RelaySettings(40.0, 2.0, 1.0), noise_std=0.02, cycle_start=(0, 200, 400),
     )  # fmt: skip
     model, gains = TransferFunction.fopdt(1.65, 1.0, 0.5), Controller(kc=0.9, ti=0.9)
-    wanted = plan(gains, model, Step(setpoint=1.0), 0.01)
+    wanted = plan(Control(gains), model, Step(setpoint=1.0), 0.01)
     assert 1.1 < wanted.peak < 2.0
     limits = Limits(30.0, 42.0)
     allowed = allowed_steps(record, model, limits, Limits(0.0, 5.0), wanted, 0.02)
@@ -236,7 +236,9 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
     assert allowed.least == rounded_up(0.02 * wanted.visible) == pytest.approx(0.15, abs=0.04)
     # The command holds down to 3.3 below; the peak of the next step of two digits is too high.
     assert low == -3.3
-    at_peak = [plan(gains, model, Step(setpoint=h), 0.01).peak for h in (high, high + 0.1)]
+    at_peak = [
+        plan(Control(gains), model, Step(setpoint=h), 0.01).peak for h in (high, high + 0.1)
+    ]
     assert at_peak[0] < 2.0 - 3.0 * 0.02 < at_peak[1]
     peak = replace(wanted, peak=1.2, visible=0.0)
     narrow = allowed_steps(record, model, Limits(39.9, 40.05), Limits(0.0, 5.0), peak, 0.02)
@@ -259,16 +261,17 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
 def test_the_least_step_is_where_the_noise_begins_to_decide(step, less):
     """The chance of a wrong verdict by its definition: many steps, judged."""
     period, rng = 0.1, np.random.default_rng(7)
-    wanted = plan(GAINS, PROCESS, step, period)
+    tried = Control(GAINS)
+    wanted = plan(tried, PROCESS, step, period)
     time = np.arange(int(wanted.duration / period) + 1) * period
 
     def failed(height: float, count: int) -> int:
         made = replace(step, setpoint=height * step.setpoint, load=height * step.load)
         response = run_loop(
-            GAINS, PROCESS, time, setpoint=made.setpoint, load=made.load
+            tried, PROCESS, time, setpoint=made.setpoint, load=made.load
         ).measurement
         noisy = (response + rng.normal(size=time.size) for _ in range(count))
-        found = (compare(GAINS, PROCESS, made, time, y, noise_std=1.0).passed for y in noisy)
+        found = (compare(tried, PROCESS, made, time, y, noise_std=1.0).passed for y in noisy)
         return count - sum(found)
 
     assert failed(wanted.visible, 20) == 0
@@ -280,7 +283,7 @@ def test_the_least_step_is_where_the_noise_begins_to_decide(step, less):
 def test_a_longer_dead_time_fails():
     slow = replace(PROCESS, dead_time=1.6)
     time, y = measured(slow, Step(setpoint=0.5))
-    assert not compare(GAINS, PROCESS, Step(setpoint=0.5), time, y).passed
+    assert not compare(Control(GAINS), PROCESS, Step(setpoint=0.5), time, y).passed
 
 
 def test_a_step_is_described_as_it_is():
@@ -298,7 +301,7 @@ def test_a_step_is_described_as_it_is():
 
 def test_gains_that_are_unstable_on_the_model_are_not_tried():
     with pytest.raises(TuningError, match="unstable loop"):
-        plan(Controller(kc=20.0, ti=1.0), PROCESS, Step(setpoint=1.0), 0.05)
+        plan(Control(Controller(kc=20.0, ti=1.0)), PROCESS, Step(setpoint=1.0), 0.05)
 
 
 # Samples that cannot be true.

@@ -22,7 +22,7 @@ from relay_autotune.errors import LoopError
 from relay_autotune.loop import laws
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes import ros2_control
-from relay_autotune.nodes.gains_place import controller_of, mapping_of
+from relay_autotune.nodes.gains_place import controller_of, in_another_node, mapping_of
 from relay_autotune.nodes.loop_client import GoneError
 from relay_autotune.nodes.ros2_control import (
     TRAJECTORY_CONTROLLER,
@@ -148,10 +148,11 @@ def test_the_strategies_differ_at_a_limit_of_the_command() -> None:
 
 
 def test_a_feedforward_is_a_weight_of_the_setpoint() -> None:
-    found = controller_of({"p": 0.5, "i": 1.0}, 0.2)
-    assert found == Controller(0.5, 0.5, b=1.4)
+    rate = laws.LawRate(laws.LAWS["control_toolbox_legacy"], 0.01)
+    found = in_another_node(controller_of({"p": 0.5, "i": 1.0}), rate, 0.2)
+    assert found.elsewhere and found.gains == Controller(0.5, 0.5, b=1.4)
     for setpoint, measured in ((2.0, 1.0), (-1.0, 0.3)):
-        law = laws.LAWS["controller_node"].at(found, 0.01).running()
+        law = found.law.running()
         wanted = 0.5 * (setpoint - measured) + 1.0 * 0.01 * (setpoint - measured) + 0.2 * setpoint
         assert law.step(setpoint, measured) == pytest.approx(wanted)
 

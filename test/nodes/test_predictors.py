@@ -6,17 +6,21 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from relay_autotune.control.controller import run_loop
+from relay_autotune.control.controller import Control, GainBounds, run_loop
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import Step, plan
 from relay_autotune.errors import NotReadyError, TuningError
+from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.laws import LAWS
 from relay_autotune.loop.sampled import UNLIMITED
+from relay_autotune.nodes.gains_place import RemoteGains, mapping_of
 from relay_autotune.nodes.results import keep
 from relay_autotune.nodes.verifier import Predictors, Rest, Verifiable, judged
 from relay_autotune.process.transfer_function import TransferFunction
@@ -54,14 +58,30 @@ def test_gains_without_an_experiment_take_the_newest_model() -> None:
     assert models.of(GOOD) == (TRUE, "")
 
 
+def test_gains_of_another_node_are_predicted_by_its_law_and_its_feed_forward() -> None:
+    """A tune told Ms 1.39, and the proof of the same gains by our own law 1.32."""
+    node: Any = SimpleNamespace(create_client=lambda *_, **__: None)
+    place = RemoteGains(node, "/pid", mapping_of("p:p,i:i,d:d"), 0.8)
+    gains = Controller(0.5, 0.6, 0.1)
+    assert place.control(gains).rate is None
+    designed: Any = SimpleNamespace(law="control_toolbox_legacy", law_period=0.01)
+    place.require_law(designed)
+    found = place.control(gains)
+    wanted = Loop(LAWS["control_toolbox_legacy"].at(gains, 0.01), TRUE).ms()
+    assert Loop(found.law, TRUE).ms() == wanted != Loop(gains, TRUE).ms()
+    assert found.elsewhere and found.law.gains.b == 1.0 + 0.8 / 0.5
+    # Such a weight is none of the gains: those of before could not come back with it.
+    GainBounds().require(place.controller_of(place.set_of(gains)))
+
+
 def test_a_sensor_that_is_too_coarse_for_a_step_gives_no_verdict() -> None:
     """The loop stands on one of its values, so that its rest shows no noise."""
     gains, step = Controller(0.5, 0.6), Step(setpoint=0.01)
     model = TransferFunction.fopdt(2.0, 0.5, 0.2)
-    tried = Verifiable([step], None, math.nan, gains, model, UNLIMITED, None)
-    planned, rest = plan(gains, model, step, 0.05), Rest(5.0, 1.0, 0.0)
+    tried = Verifiable([step], None, math.nan, Control(gains), model, UNLIMITED)
+    planned, rest = plan(Control(gains), model, step, 0.05), Rest(5.0, 1.0, 0.0)
     time = np.arange(0.0, planned.duration, 0.05)
-    exact = 5.0 + run_loop(gains, model, time, setpoint=0.01).measurement
+    exact = 5.0 + run_loop(Control(gains), model, time, setpoint=0.01).measurement
 
     def seen(resolution: float) -> Any:
         y = np.round(exact / resolution) * resolution
