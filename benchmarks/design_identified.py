@@ -27,7 +27,7 @@ import numpy as np
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.methods import identify
 from relay_autotune.loop.analysis import is_stable
-from relay_autotune.loop.stability import frequencies, sensitivity_peaks
+from relay_autotune.loop.stability import frequencies, peaks
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 from relay_autotune.tuning.ensemble import ensemble
@@ -68,7 +68,7 @@ def outcome(title: str, model: TransferFunction, record: Record, derivative: boo
     if not is_stable(controller, model):
         return Outcome(title, f"unstable, designed on {found.structure}")
     loop = controller.loop(model)
-    ms, _ = sensitivity_peaks(loop, frequencies(loop))
+    (ms, _), _ = peaks(loop, frequencies(loop))
     best = Search(model).optimum(Bounds(MS, options.largest_mt(model)), derivative=derivative)
     assert best is not None, "no process of the batch is unstable"
     ratio = load_error(controller, model) / load_error(best.controller, model)

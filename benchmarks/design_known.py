@@ -26,7 +26,7 @@ import numpy as np
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.loop.analysis import Loop, is_stable
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.stability import frequencies, margins, sensitivity_peaks
+from relay_autotune.loop.stability import frequencies, peaks
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning import RULES
@@ -62,8 +62,8 @@ class Design:
 def load_error(controller: Controller, model: TransferFunction) -> float:
     """Return the IAE of a unit step of the load [y s/u]."""
     loop = controller.loop(model)
-    found = margins(loop, frequencies(loop))
-    return Loop(controller, model).figures(found.ms_frequency).iae_load
+    (_, frequency), _ = peaks(loop, frequencies(loop))
+    return Loop(controller, model).figures(frequency).iae_load
 
 
 def designed(model: TransferFunction, derivative: bool) -> Design:
@@ -73,7 +73,7 @@ def designed(model: TransferFunction, derivative: bool) -> Design:
     assert optimum is not None, "no process of the batch is unstable"
     found = optimum.controller
     loop = found.loop(model)
-    ms, mt = sensitivity_peaks(loop, frequencies(loop))
+    (ms, _), (mt, _) = peaks(loop, frequencies(loop))
     iae = load_error(found, model)
     judge = Judge(model, bounds.ms, bounds.mt)
     other = best_on_a_grid(judge, found, iae, spread=SPREAD[derivative])
@@ -134,7 +134,7 @@ def judged(model: TransferFunction, best: float, tallies: dict[str, Tally]) -> N
             tally.ms.append(math.inf)
             continue
         loop = controller.loop(model)
-        tally.ms.append(sensitivity_peaks(loop, frequencies(loop))[0])
+        tally.ms.append(peaks(loop, frequencies(loop))[0][0])
         try:
             tally.ratios.append(load_error(controller, model) / best)
         except RelayAutotuneError:

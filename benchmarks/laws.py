@@ -128,8 +128,8 @@ def tried(title: str, model: TransferFunction, law: str, rate: float) -> Case:
     except RelayAutotuneError as error:
         return Case(rate, law, title, why=str(error))
     runs = task.law(controller)
-    found = Loop(runs, model).margins()
-    measured = measured_ms(runs, model, found.ms_frequency)
+    found, frequency = Loop(runs, model).margins()
+    measured = measured_ms(runs, model, frequency)
     unnamed = task.law(unnamed_gains(model, period))
     return Case(rate, law, title, found.ms, measured, Loop(unnamed, model).ms())
 

@@ -34,7 +34,7 @@ from relay_autotune.analysis import analyse
 from relay_autotune.identification.known import Known
 from relay_autotune.loop.analysis import is_stable
 from relay_autotune.loop.gains import Gains
-from relay_autotune.loop.stability import frequencies, sensitivity_peaks
+from relay_autotune.loop.stability import frequencies, peaks
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Outcome
 from relay_autotune.result import Analysis
@@ -107,7 +107,7 @@ def judge(result: Result, experiment: Experiment, found: Analysis) -> None:
     result.asked = promised_ms(gains)
     if result.stable:
         grid = frequencies(*gains.characteristic(sampled))
-        peak, _ = sensitivity_peaks(lambda s: gains(s) * sampled(s), grid)
+        (peak, _), _ = peaks(lambda s: gains(s) * sampled(s), grid)
         result.ms = max(peak, 1.0)
 
 

@@ -29,15 +29,21 @@ import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import RelayAutotuneError, TuningError
-from relay_autotune.loop.gains import ControlLaw, Controller, Gains, Performance, StepFigures
+from relay_autotune.loop.gains import (
+    ControlLaw,
+    Controller,
+    Gains,
+    Margins,
+    Performance,
+    StepFigures,
+)
 from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate, SampledLaw
 from relay_autotune.loop.stability import (
-    LoopMargins,
     closed_loop_unstable_poles,
     frequencies,
     margins,
+    peaks,
     sampled_unstable_poles,
-    sensitivity_peaks,
 )
 from relay_autotune.process.response import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
@@ -160,13 +166,6 @@ class Loop:
         poles = int(self._process.unstable_poles[0])
         return sampled_unstable_poles(self, self.grid, self.law.period, poles, integrators)
 
-    @cached_property
-    def _end(self) -> float:
-        """L at the highest frequency, half that of the samples; 0 of a continuous loop."""
-        if self.law.period == 0.0:
-            return 0.0
-        return float(self(np.array([1j * math.pi / self.law.period]))[0].real)
-
     def ms(self) -> float:
         """Return the largest magnitude of the sensitivity function.
 
@@ -177,25 +176,20 @@ class Loop:
                 return math.inf
         except RelayAutotuneError:
             return math.inf
-        return max(sensitivity_peaks(self, self.grid)[0], 1.0 / abs(1.0 + self._end))
+        return peaks(self, self.grid)[0][0]
 
-    def margins(self) -> LoopMargins:
-        """Return the margins of the loop, which must be stable.
+    def margins(self) -> tuple[Margins, float]:
+        """Return the margins of the loop, which must be stable, and the frequency of its Ms.
 
         The delay margin is the phase margin over its frequency, also of a sampled loop.
         """
-        at_rest = None
-        if self.model.integrators == 0 and not self.law.i:
-            at_rest = float(self.law(np.zeros(1, dtype=np.complex128))[0].real) * self.model.gain
-        found, end = margins(self, self.grid, at_rest), self._end
-        more = {"mt": max(found.mt, abs(end / (1.0 + end)))}
-        if 1.0 / abs(1.0 + end) > found.ms:
-            more |= {"ms": 1.0 / abs(1.0 + end), "ms_frequency": math.pi / self.law.period}
-        if end < -1.0:
-            more["gain_margin_low"] = max(found.gain_margin_low, -1.0 / end)
-        elif end < 0.0:
-            more["gain_margin"] = min(found.gain_margin, -1.0 / end)
-        return replace(found, **more)
+        integrates, ends = self.model.integrators > 0 or bool(self.law.i), []
+        if not integrates:
+            at_rest = self.law(np.zeros(1, dtype=np.complex128))[0].real
+            ends.append(float(at_rest) * self.model.gain)
+        if self.law.period > 0.0:
+            ends.append(float(self(np.array([1j * math.pi / self.law.period]))[0].real))
+        return margins(self, self.grid, ends, integrates=integrates)
 
     def noise_gain(self) -> float:
         """Return the standard deviation of the command per that of white noise [u/y].
@@ -363,9 +357,9 @@ class Loop:
             raise TuningError(
                 f"{law} makes an unstable loop with the model{how}: use another rule{shorter}"
             )
-        found = vars(self.margins()).copy()
-        figures = self.figures(found.pop("ms_frequency"))
-        return Performance(**found, **vars(figures), noise_gain=self.noise_gain())
+        found, frequency = self.margins()
+        figures = self.figures(frequency)
+        return Performance(**vars(found), **vars(figures), noise_gain=self.noise_gain())
 
 
 def _has_settled(tail: FloatArray) -> bool:

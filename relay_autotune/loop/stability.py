@@ -317,16 +317,6 @@ _FOLLOWED, _MOST_DIVISIONS = 1.0, 40
 _MOST_TURNS = 800.0 * math.pi
 
 
-@dataclass(frozen=True, kw_only=True)
-class LoopMargins(Margins):
-    """Margins, and where the sensitivity is largest.
-
-    :param ms_frequency: frequency of that maximum [rad/s].
-    """
-
-    ms_frequency: float
-
-
 def frequencies(
     *terms: TransferFunction,
     times: Iterable[float] = (),
@@ -382,18 +372,13 @@ def _relevant_frequencies(values: ComplexArray, grid: FloatArray) -> FloatArray:
     return found if found.size else grid[:1]
 
 
-def sensitivity_peaks(loop: Loop, grid: FloatArray) -> tuple[float, float]:
-    """Return (Ms, Mt), the largest magnitudes of ``1/(1 + L)`` and ``L/(1 + L)``.
+def peaks(loop: Loop, grid: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return Ms and Mt, the largest magnitudes of ``1/(1 + L)`` and ``L/(1 + L)``.
 
     :param loop: L as a function of s.
     :param grid: frequencies that show the peaks roughly [rad/s], increasing.
+    :return: each with its frequency.
     """
-    (ms, _), (mt, _) = peaks(loop, grid)
-    return ms, mt
-
-
-def peaks(loop: Loop, grid: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the largest magnitudes of both sensitivities, each with its frequency."""
     values = loop(1j * grid)
     sensitivity = 1.0 / np.abs(1.0 + values)
     log_grid = np.log(grid)
@@ -433,12 +418,16 @@ def _changes(values: FloatArray) -> NDArray[np.intp]:
     return np.flatnonzero((values[:-1] >= 0.0) != (values[1:] >= 0.0))
 
 
-def margins(loop: Loop, grid: FloatArray, at_rest: float | None = None) -> LoopMargins:
-    """Return the margins of a stable loop.
+def margins(
+    loop: Loop, grid: FloatArray, ends: Sequence[float], *, integrates: bool
+) -> tuple[Margins, float]:
+    """Return the margins of a stable loop, and the frequency at which its sensitivity is largest.
 
     :param loop: L as a function of s.
     :param grid: frequencies fine enough to show every crossing [rad/s], increasing.
-    :param at_rest: L(0), if it is finite; None: it is not finite.
+    :param ends: L where it is real by itself: at rest, unless it integrates, and at half the
+        sampling frequency.
+    :param integrates: whether L(0) is infinite.
     """
     values, log_grid = loop(1j * grid), np.log(grid)
 
@@ -448,10 +437,8 @@ def margins(loop: Loop, grid: FloatArray, at_rest: float | None = None) -> LoopM
     cells = _changes(values.imag)
     cells = cells[(values.real[cells] < 0.0) | (values.real[cells + 1] < 0.0)]
     crossings = np.exp(roots(lambda x: loop(1j * np.exp(x)).imag, *log_ends(cells), _EXACT))
-    real = loop(1j * crossings).real if crossings.size else np.empty(0)
+    real = np.append(loop(1j * crossings).real if crossings.size else np.empty(0), ends)
     gains = -1.0 / real[real < 0.0]
-    if at_rest is not None and at_rest < 0.0:
-        gains = np.append(gains, -1.0 / at_rest)
     size = np.log(np.abs(values))
     cells = _changes(size)
     crossovers = np.exp(
@@ -460,13 +447,13 @@ def margins(loop: Loop, grid: FloatArray, at_rest: float | None = None) -> LoopM
     lead = np.angle(-loop(1j * crossovers)) if crossovers.size else np.empty(0)
     delays = np.mod(lead, 2.0 * math.pi) / crossovers
     (ms, at), (mt, _) = peaks(loop, grid)
-    return LoopMargins(
+    found = Margins(
         # ms tends to 1 for w -> infinity; mt tends to 1 for w -> 0 with integral action.
         ms=max(ms, 1.0),
-        ms_frequency=at,
-        mt=max(mt, 1.0) if at_rest is None else mt,
+        mt=max(mt, 1.0) if integrates else mt,
         gain_margin=float(gains[gains > 1.0].min(initial=math.inf)),
         gain_margin_low=float(gains[gains < 1.0].max(initial=0.0)),
         phase_margin=float(np.abs(lead).min(initial=math.pi)),
         delay_margin=float(delays.min(initial=math.inf)),
     )
+    return found, at

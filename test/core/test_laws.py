@@ -226,9 +226,9 @@ def test_its_ms_is_that_of_a_sinusoidal_test_of_its_source(name):
     law = LAWS[name]
     gains = law.best(WANTED, PERIOD)
     loop = Loop(law.at(gains, PERIOD), PROCESS)
-    found = loop.margins()
+    found, frequency = loop.margins()
     plant, source, command = FopdtPlant(0.9, 2.0, 0.8), Source(name, gains), 0.0
-    turns, count = found.ms_frequency * PERIOD, 1200
+    turns, count = frequency * PERIOD, 1200
     seen = np.empty(count)
     for k in range(count):
         seen[k] = plant.advance(k * PERIOD, command) + math.sin(turns * k)
