@@ -9,12 +9,10 @@ Measurement noise in the command, without feedback through the loop, and the fil
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.loop.gains import Controller
@@ -22,7 +20,7 @@ from relay_autotune.loop.laws import LawRate, Smoothing, taps_of
 from relay_autotune.loop.sampled import filter_elements
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import unstable_at_small_gain
-from relay_autotune.tuning.frontier import Bounds, Responses
+from relay_autotune.tuning.frontier import Bounds, Candidates, Responses
 
 # Grid of filter time constant over sampling period, for interpolation.
 _RATIOS = np.geomspace(1e-3, 1e4, 141)
@@ -126,41 +124,6 @@ def filters_of(
 
 
 @dataclass(frozen=True)
-class Candidates:
-    """Controllers to compare, with positive gains whatever the sign of the process.
-
-    :param kp: proportional gains, shape (k,).
-    :param ki: integral gains, shape (k,).
-    :param td: derivative times [s], shape (k,).
-    :param tf: time constants of the filter [s], shape (k,).
-    """
-
-    kp: FloatArray
-    ki: FloatArray
-    td: FloatArray
-    tf: FloatArray
-
-    @classmethod
-    def joined(cls, parts: Sequence[Candidates]) -> Candidates:
-        """Return all of them, one after the other."""
-        fields = zip(*((c.kp, c.ki, c.td, c.tf) for c in parts), strict=True)
-        return cls(*(np.concatenate(field) for field in fields))
-
-    def __getitem__(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Candidates:
-        return Candidates(self.kp[index], self.ki[index], self.td[index], self.tf[index])
-
-    def controller(self, k: int, sign: int, rate: LawRate) -> Controller:
-        """Return controller k with the sign of the process.
-
-        :param rate: the law, of which kp and td hold what its integral adds in half a sample.
-        """
-        ki, kd = float(self.ki[k]), float(self.kp[k] * self.td[k])
-        kp = float(self.kp[k]) - rate.law.integral.value * 0.5 * rate.period * ki
-        tf = rate.law.smoothing.setting(float(self.tf[k]), rate.period)
-        return Controller(sign * kp, kp / ki, kd / kp, tf)
-
-
-@dataclass(frozen=True)
 class Optimum:
     """The controller that a search found.
 
@@ -246,7 +209,7 @@ class Surroundings:
         :param bounds: on the sensitivities.
         :param c: the controller.
         """
-        highs, _ = self._largest_ki(bounds, c)
+        highs, _ = self._responses.largest_ki(bounds, c.single())
         order = np.argsort(highs[0], kind="stable")
         return Surroundings(self._responses, order[: _FIRST * (self._outside + 1)])
 
@@ -258,33 +221,20 @@ class Surroundings:
         """
         if self._order.size == self._responses.count:
             return None
-        highs, lows = self._largest_ki(bounds, c)
+        highs, lows = self._responses.largest_ki(bounds, c.single())
         fails = np.flatnonzero((highs[0] < _SAME * c.ki) | (lows[0] >= c.ki))
         new = np.setdiff1d(fails, self._order)
         if fails.size <= self._outside or not new.size:
             return None
         return Surroundings(self._responses, np.concatenate((new, self._order)))
 
-    def _largest_ki(self, bounds: Bounds, c: Candidates) -> tuple[FloatArray, FloatArray]:
-        """Return the ends of the range that each of all models leaves, shape (k, m)."""
-        kp, td, tf = (x.astype(np.float32) for x in (c.kp, c.td, c.tf))
-        return self._responses.largest_ki(bounds, kp, td, tf)
-
     def limits(
-        self,
-        bounds: Bounds,
-        kp: FloatArray,
-        td: FloatArray,
-        tf: FloatArray,
-        upper: FloatArray,
-        least: FloatArray,
+        self, bounds: Bounds, c: Candidates, upper: FloatArray, least: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return the largest integral gains and the least, shape (k,).
 
         :param bounds: on the sensitivities.
-        :param kp: proportional gains, positive, shape (k,).
-        :param td: derivative times [s], shape (k,).
-        :param tf: time constants of the filter [s], shape (k,).
+        :param c: the controllers, k of them.
         :param upper: the largest integral gain on the process itself, shape (k,).
         :param least: gains below this are of no interest, shape (k,).
         :return: the largest is -inf if there is none, or none of interest.
@@ -292,7 +242,8 @@ class Surroundings:
         outside = self._outside
         split = _FIRST * (outside + 1)
         first, rest = self._order[:split], self._order[split:]
-        highs, lows = self._responses.largest_ki(bounds, kp, td, tf, first)
+        c = c.single()
+        highs, lows = self._responses.largest_ki(bounds, c, first)
         # The other models can only lower it.
         useful = np.minimum(upper, np.sort(highs, axis=1)[:, outside]) > least
         largest, lowest = np.full(upper.shape, -math.inf), np.zeros(upper.shape)
@@ -300,8 +251,7 @@ class Surroundings:
             return largest, lowest
         highs, lows = highs[useful], lows[useful]
         if rest.size:
-            few = kp[useful], td[useful], tf[useful]
-            more = self._responses.largest_ki(bounds, *few, rest)
+            more = self._responses.largest_ki(bounds, c[useful], rest)
             highs, lows = (np.hstack(both) for both in zip((highs, lows), more, strict=True))
             self._order = self._order[np.argsort(highs[0], kind="stable")]
         ends = np.minimum(upper[useful], np.sort(highs, axis=1)[:, outside])

@@ -42,6 +42,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.arrays import ComplexArray, FloatArray, IntArray
+from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import CONTINUOUS, LawRate, polynomial
 from relay_autotune.process.response import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
@@ -79,6 +80,50 @@ class Bounds:
             return (sensitivity,)
         square = self.mt**2
         return (sensitivity, (square / (square - 1.0), self.mt / (square - 1.0)))
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Controllers to compare, with positive gains whatever the sign of the process.
+
+    :param kp: proportional gains, shape (k,).
+    :param ki: integral gains, shape (k,).
+    :param td: derivative times [s], shape (k,).
+    :param tf: time constants of the filter [s], shape (k,).
+    """
+
+    kp: FloatArray
+    ki: FloatArray
+    td: FloatArray
+    tf: FloatArray
+
+    @property
+    def kd(self) -> FloatArray:
+        """Derivative gains, shape (k,)."""
+        return self.kp * self.td
+
+    def single(self) -> Candidates:
+        """Return them in single precision."""
+        return Candidates(*(x.astype(np.float32) for x in (self.kp, self.ki, self.td, self.tf)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Candidates]) -> Candidates:
+        """Return all of them, one after the other."""
+        fields = zip(*((c.kp, c.ki, c.td, c.tf) for c in parts), strict=True)
+        return cls(*(np.concatenate(field) for field in fields))
+
+    def __getitem__(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Candidates:
+        return Candidates(self.kp[index], self.ki[index], self.td[index], self.tf[index])
+
+    def controller(self, k: int, sign: int, rate: LawRate) -> Controller:
+        """Return controller k with the sign of the process.
+
+        :param rate: the law, of which kp and td hold what its integral adds in half a sample.
+        """
+        ki, kd = float(self.ki[k]), float(self.kd[k])
+        kp = float(self.kp[k]) - rate.law.integral.value * 0.5 * rate.period * ki
+        tf = rate.law.smoothing.setting(float(self.tf[k]), rate.period)
+        return Controller(sign * kp, kp / ki, kd / kp, tf)
 
 
 class Responses:
@@ -141,26 +186,22 @@ class Responses:
     def largest_ki(
         self,
         bounds: Bounds,
-        kp: FloatArray,
-        td: FloatArray,
-        tf: FloatArray,
+        c: Candidates,
         of: IntArray | slice = _ALL,
     ) -> tuple[FloatArray, FloatArray]:
         """Return the largest integral gains that the bounds leave, and how far they may fall.
 
         :param bounds: on the sensitivities.
-        :param kp: kp', positive, shape (k,).
-        :param td: td' [s], shape (k,).
-        :param tf: time constants of the filter [s], shape (k,).
+        :param c: controllers with kp' and td', k of them, of which ki is not used.
         :param of: which models, m of them.
         :return: upper and lower ends of the range, shape (k, m), for the controllers in each
             model; an upper end not positive: none is allowed; infinite: any above the lower.
         """
-        if not kp.size:
+        if not c.kp.size:
             # No filter keeps the limit of the noise.
             return (np.empty((0, self._poles[of].size)),) * 2
-        column = self._relevant(bounds, kp, td, tf)
-        w, own, unfiltered = self._law(kp, td, tf, column)
+        column = self._relevant(bounds, c)
+        w, own, unfiltered = self._law(c, column)
         inverse = self.inverse[of][None, :, column]
         if unfiltered is not None:
             inverse = unfiltered[:, None, :] * inverse
@@ -172,11 +213,11 @@ class Responses:
         # A loop that begins left of -1 has a real pole there, which moves with the phase.
         turns = np.sign(lead[..., 0] * x[..., 0] - base[..., 0] * y[..., 0])
         count = count + np.where(self._at_rest[of] & (reach[..., 0] > 0.0), turns, 0.0)
-        crossing = first_crossing(reach, w * (lead + y), kp)
+        crossing = first_crossing(reach, w * (lead + y), c.kp)
         return envelope(bounds, own, w, (x, y), np.where(count == 0, crossing, 0.0))
 
     def _law(
-        self, kp: FloatArray, td: FloatArray, tf: FloatArray, column: NDArray[np.bool_]
+        self, c: Candidates, column: NDArray[np.bool_]
     ) -> tuple[FloatArray, tuple[FloatArray, FloatArray], ComplexArray | None]:
         """Return what the law does at some frequencies.
 
@@ -184,16 +225,16 @@ class Responses:
             1); 1/V, shape (k, n), None: there is no filter.
         """
         h, smoothing = self._rate.period, self._rate.law.smoothing
-        gain, lead, dtype = kp[:, None, None], (kp * td)[:, None, None], self.inverse.dtype
-        filtered = bool(np.any(tf))
+        gain, lead, dtype = c.kp[:, None, None], c.kd[:, None, None], self.inverse.dtype
+        filtered = bool(np.any(c.tf))
         if h == 0.0:
             w = self.grid[column]
-            s = 1j * w * tf[:, None]
+            s = 1j * w * c.tf[:, None]
             return w, (gain, lead * w), 1.0 + s + 0.5 * s * s if filtered else None
-        w, back, time = self._warped[column], self._back[column], tf[:, None]
+        w, back, time = self._warped[column], self._back[column], c.tf[:, None]
         slope = smoothing.slope(time, h)
         if not (filtered and smoothing.on_measurement):
-            values = np.atleast_2d(slope(back)) if np.any(td) else np.zeros((1, w.size), dtype)
+            values = np.atleast_2d(slope(back)) if np.any(c.td) else np.zeros((1, w.size), dtype)
             unfiltered = None
         else:
             # Value and slope of one filter have their denominator in common.
@@ -204,19 +245,17 @@ class Responses:
         values = values.astype(dtype)[:, None, :]
         return w, (gain + lead * values.real, lead * values.imag), unfiltered
 
-    def _relevant(
-        self, bounds: Bounds, kp: FloatArray, td: FloatArray, tf: FloatArray
-    ) -> NDArray[np.bool_]:
+    def _relevant(self, bounds: Bounds, c: Candidates) -> NDArray[np.bool_]:
         """Return the frequencies at which some loop is large enough to meet a bound.
 
         Beyond the crossover the integral adds little to the loop.
         """
         w = self.grid
-        largest = np.sqrt((kp[:, None] ** 2 + ((kp * td)[:, None] * w) ** 2).max(axis=0))
+        largest = np.sqrt((c.kp[:, None] ** 2 + (c.kd[:, None] * w) ** 2).max(axis=0))
         smallest = self._smallest
         if self._rate.period == 0.0:
-            smallest = smallest * np.sqrt(1.0 + 0.25 * (w * tf.min()) ** 4)
-        room = min(c - r for c, r in bounds.circles)
+            smallest = smallest * np.sqrt(1.0 + 0.25 * (w * c.tf.min()) ** 4)
+        room = min(centre - r for centre, r in bounds.circles)
         found = (w < _BEYOND * self.crossover) | (2.0 * largest > room * smallest)
         # The end of the circle, where a loop has a real pole.
         found[-1] |= self._rate.period > 0.0

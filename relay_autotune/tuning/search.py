@@ -37,14 +37,8 @@ from relay_autotune.loop.stability import peaks
 from relay_autotune.process.response import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.tuning.candidates import (
-    Candidates,
-    Optimum,
-    Surroundings,
-    filters_of,
-    stable_gains,
-)
-from relay_autotune.tuning.frontier import Bounds, Responses, design_grid
+from relay_autotune.tuning.candidates import Optimum, Surroundings, filters_of, stable_gains
+from relay_autotune.tuning.frontier import Bounds, Candidates, Responses, design_grid
 
 _POINTS = 512
 _RESETS, _TURNS = 6.0, 5.0
@@ -376,10 +370,11 @@ class Search:
         zero = np.zeros(9)
         while step > 1e-5:
             kp = best * np.exp(step * np.linspace(-1.0, 1.0, 9))
-            ki, _ = self._limits(bounds, kp, zero, zero)
-            k = int(np.argmax(ki))
+            c = Candidates(kp, zero, zero, zero)
+            c = replace(c, ki=self._limits(bounds, c)[0])
+            k = int(np.argmax(c.ki))
             best, step = float(kp[k]), step / 4.0
-        return Candidates(kp, ki, zero, zero).controller(k, self.model.process_sign, self.rate)
+        return c.controller(k, self.model.process_sign, self.rate)
 
     def _times(self, derivative: bool) -> FloatArray:
         return _TIMES * 2.0 * math.pi / self.frequency if derivative else np.zeros(1)
@@ -474,7 +469,7 @@ class Search:
             iaes = self._iaes(scanned[rest])
             if iaes.min() < iae:
                 best, iae = int(rest[np.argmin(iaes)]), float(iaes.min())
-        kp, kd = scanned.kp[best], scanned.kp[best] * scanned.td[best]
+        kp, kd = scanned.kp[best], scanned.kd[best]
         return np.log([kp, *([kd] if kd > 0.0 else []), 1.0]), iae
 
     def descend(
@@ -533,19 +528,17 @@ class Search:
         kp = np.exp(points[:, 0])
         td = np.exp(points[:, 1] - points[:, 0]) if points.shape[1] > 2 else np.zeros(kp.size)
         tf = self._filters(kp, td)
+        found = Candidates(kp, np.full(kp.size, -math.inf), td, tf)
         usable = np.isfinite(tf)
-        ki = np.full(kp.size, -math.inf)
         if not usable.any():
-            return Candidates(kp, ki, td, tf)
+            return found
         share = np.exp(points[usable, -1])
-        upper, lower = self._limits(
-            bounds, kp[usable], td[usable], tf[usable], 1.0 / (share * iae)
-        )
+        upper, lower = self._limits(bounds, found[usable], 1.0 / (share * iae))
         chosen = np.minimum(upper, self._ceiling(kp[usable])) * share
         # Beyond, the integral action alone would close the loop where no frequency was looked at.
         chosen[np.isfinite(chosen) & (chosen > self._beyond)] = -math.inf
-        ki[usable] = np.where(chosen > _CLEAR * lower, chosen, -math.inf)
-        return Candidates(kp, ki, td, tf)
+        found.ki[usable] = np.where(chosen > _CLEAR * lower, chosen, -math.inf)
+        return found
 
     @cached_property
     def _beyond(self) -> float:
@@ -557,25 +550,19 @@ class Search:
         return highest / float(np.abs(self.model(1j * highest)))
 
     def _limits(
-        self,
-        bounds: Bounds,
-        kp: FloatArray,
-        td: FloatArray,
-        tf: FloatArray,
-        least: FloatArray | float = 0.0,
+        self, bounds: Bounds, c: Candidates, least: FloatArray | float = 0.0
     ) -> tuple[FloatArray, FloatArray]:
         """Return the largest integral gains and the least, shape (k,).
 
         :param least: gains below this are of no interest, shape (k,).
         """
-        found = self.responses.largest_ki(bounds, kp, td, tf)
+        found = self.responses.largest_ki(bounds, c)
         upper, lower = found[0][:, 0], found[1][:, 0]
         some = upper > least
         if self.around is None or not some.any():
             return upper, lower
-        kp, td, tf = (x[some].astype(np.float32) for x in (kp, td, tf))
         least = np.broadcast_to(least, upper.shape)[some]
-        ends = self.around.limits(bounds, kp, td, tf, upper[some], least)
+        ends = self.around.limits(bounds, c[some], upper[some], least)
         upper, lower = np.where(some, upper, -math.inf), lower.copy()
         upper[some], lower[some] = ends[0], np.maximum(lower[some], ends[1])
         return upper, lower
@@ -593,7 +580,7 @@ class Search:
             return load_iaes(self.late, c.kp, c.ki, c.td, c.tf, self.frequency)
         s, process = self._line
         back, tf = np.exp(-s * h), c.tf[:, None]
-        p, d, i = c.kp[:, None], (c.kp * c.td)[:, None], c.ki[:, None]
+        p, d, i = c.kp[:, None], c.kd[:, None], c.ki[:, None]
         law = smoothing.value(tf, h)(back) * (p + i * 0.5 * h * (1.0 + back) / (1.0 - back))
         if np.any(c.td):
             law = law + d * smoothing.slope(tf, h)(back)

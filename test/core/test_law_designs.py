@@ -19,7 +19,7 @@ from relay_autotune.loop.laws import LAWS, LawRate
 from relay_autotune.process.structures import INTEGRATOR_LAG, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import design, tune
-from relay_autotune.tuning.frontier import Bounds, Responses
+from relay_autotune.tuning.frontier import Bounds, Candidates, Responses
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 PROCESSES = {
@@ -169,7 +169,7 @@ def test_a_pole_that_is_unstable_below_the_grid_leaves_gains():
     grid = np.geomspace(0.01, 0.99 * math.pi / period, 3000)
     responses = Responses((model,), grid, 1.0, LawRate(law, period))
     none = np.zeros(1)
-    highs, _ = responses.largest_ki(Bounds(1.8), np.array([kp]), none, none)
+    highs, _ = responses.largest_ki(Bounds(1.8), Candidates(np.array([kp]), none, none, none))
     ki = float(highs[0, 0])
     # The backward integral takes half a sample from the proportional gain.
     gains = Controller(kp - 0.5 * period * ki, (kp - 0.5 * period * ki) / ki)
@@ -184,6 +184,7 @@ def test_where_an_inverse_overflows_the_limits_are_right_and_nobody_is_warned():
         kp, tf = np.array([[0.1], [1e6]], precision)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            highs, _ = Responses((model,), grid, 1.0).largest_ki(Bounds(1.6), kp, 0.0 * kp, tf)
+            tried = Candidates(kp, kp, 0.0 * kp, tf)
+            highs, _ = Responses((model,), grid, 1.0).largest_ki(Bounds(1.6), tried)
         found.append(highs[0, 0])
     assert found[0] == pytest.approx(found[1], rel=1e-3)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -238,22 +239,17 @@ def _with_static_gain(
     test: RelayTest, record: Record, points: tuple[FrequencyPoint, ...], structure: Structure
 ) -> _Points:
     """Add the static gain as a point at w = 0, where the means show it and the model has one."""
-    frequency = [p.frequency for p in points]
-    value = [p.value for p in points]
-    std = [p.std for p in points]
-    settings = test.settings
-    rest = steady_state(record, settings)
+    rest = steady_state(record, test.settings)
     if not structure.integrators and rest.measured:
-        try:
+        # The mean command of an unbiased relay is the baseline.
+        with suppress(IdentificationError):
             gain = static_gain(test, rest)
-        except IdentificationError:
-            # The mean command of an unbiased relay is the baseline.
-            pass
-        else:
-            frequency.insert(0, 0.0)
-            value.insert(0, complex(gain.value))
-            std.insert(0, gain.std(rest))
-    return _Points(np.array(frequency), np.array(value), np.array(std))
+            points = (FrequencyPoint(0.0, complex(gain.value), gain.std(rest)), *points)
+    return _Points(
+        np.array([p.frequency for p in points]),
+        np.array([p.value for p in points]),
+        np.array([p.std for p in points]),
+    )
 
 
 def _fit(structure: Structure, known: Known, sign: int, points: _Points) -> Fit:
