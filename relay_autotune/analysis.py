@@ -38,7 +38,6 @@ from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.quantities import LONGEST, NORMAL_95, SHORTEST, Quantity, declared
-from relay_autotune.reasons import Code
 from relay_autotune.record.cycles import cycles_of, limit_cycle
 from relay_autotune.record.record import Cycle, Outcome, Record, one_record
 from relay_autotune.record.thinning import thinned
@@ -389,12 +388,7 @@ def _with_remarks(found: Identification, records: Sequence[Record]) -> Identific
 
 
 def _refusal(record: Record) -> str:
-    told = f"{_NO_GAINS[record.outcome]}: no gains. {record.reason}".strip()
-    defect = Code.NODE_FAILED.row
-    # Older recordings have the sentence without what to do.
-    begins = record.reason.startswith(defect.found.partition("{")[0])
-    is_bare = begins and defect.remedy not in record.reason
-    return f"{told}; {defect.remedy}" if is_bare else told
+    return f"{_NO_GAINS[record.outcome]}: no gains. {record.reason}".strip()
 
 
 def _without_gains(found: Analysis, judgement: Judgement) -> Analysis:

@@ -72,7 +72,15 @@ class SelectionError(BagError):
 
 
 class NotThereError(SelectionError):
-    """A recording does not have a topic or column of the name that was given."""
+    """A recording does not have a topic or column of the name that was given.
+
+    :param lacking: what it does not have.
+    :param there: what it has; empty: that is told already.
+    """
+
+    def __init__(self, lacking: str, there: str = "") -> None:
+        super().__init__("; ".join(filter(None, (lacking, there))))
+        self.lacking = lacking
 
 
 class FieldError(RelayAutotuneError, ValueError):

@@ -512,5 +512,5 @@ def _named(path: Path, names: Sequence[str], wanted: str) -> int:
             f"{path} has {len(fits)} columns named {wanted!r}; expected a name of its own for each"
         )
     if not fits:
-        raise NotThereError(f"{path} has no column {wanted!r}; its columns are {listed(names)}")
+        raise NotThereError(f"{path} has no column {wanted!r}", f"its columns are {listed(names)}")
     return fits[0]

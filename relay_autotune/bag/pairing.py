@@ -133,7 +133,7 @@ def _checked(topics: Topics, role: str, wanted: str) -> str:
         topic = f"/{topic}"
     if topic not in types:
         raise NotThereError(
-            f"{topics.path} has no topic {topic!r} for the {role}; it has {topics.listing()}"
+            f"{topics.path} has no topic {topic!r} for the {role}", f"it has {topics.listing()}"
         )
     return topics.field_of(topic, part)
 

@@ -194,7 +194,7 @@ def analysed(
     except NotThereError as error:
         if not job.among_others:
             raise
-        said.append(f"{str(error).partition(';')[0]}: it is read by its own names")
+        said.append(f"{error.lacking}: it is read by its own names")
         own = replace(job.selection, measurement=None, command=None, time=None)
         recording = read_experiments(job.paths, own, progress)
     said += [f"{job.name}: {note}" for note in recording.notes]

@@ -18,7 +18,7 @@ from relay_autotune.cli.terminal import (
     broken,
     in_columns,
     labelled,
-    told_in,
+    with_units,
 )
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
@@ -59,7 +59,7 @@ def table(
     blocks = [bag]
     for number, analysis in enumerate(analyses, start=1):
         which = f" {number} of {len(analyses)}" if len(analyses) > 1 else ""
-        with told_in(analysis.record.units):
+        with with_units(analysis.record.units):
             blocks.append("\n".join(_laid_out(_experiment(analysis, which), width)))
             if compared := compared_lines(analysis, present, width):
                 blocks.append("\n".join(compared))
@@ -78,7 +78,7 @@ def compared_lines(
     model, gains = analysis.model, analysis.best_gains
     if present is None or model is None or gains is None:
         return []
-    with told_in(analysis.record.units):
+    with with_units(analysis.record.units):
         return beside(present, gains, model.model, width, "present", analysis.added_delay)
 
 

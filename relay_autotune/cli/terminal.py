@@ -43,7 +43,7 @@ UNITS: dict[str, str] = {}
 
 
 @contextmanager
-def told_in(units: Mapping[str, str]) -> Iterator[None]:
+def with_units(units: Mapping[str, str]) -> Iterator[None]:
     """Tell of another loop in the block.
 
     :param units: of its measurement, by "y", and of its command, by "u", as far as known.

@@ -180,11 +180,8 @@ def settings(gains: Gains, law: Law, target: Target) -> str:
         f"For {law.program}.{of_command}",
         f"{where}At the limits of the command: {law.limits}.",
     )
-    if law.ending == _STRUCTURED_TEXT:
-        told += (
-            "KP is in u/y: a block that scales to measuring ranges takes KP times the range of "
-            "its measurement over that of its command.",
-        )
+    if law.scale:
+        told += (law.scale,)
     if law.sign:
         sign = law.sign.format(sign="positive" if gains.kc < 0.0 else "negative")
         told += (f"{sign}, with kc {gains.kc:.6g}.",)
@@ -224,8 +221,6 @@ def node_parameters(gains: Gains, values: Mapping[str, Any], topics: Mapping[str
     return "\n".join([f"{text}{TOPICS}:", "  ros__parameters:", *lines]) + "\n"
 
 
-# Ending of the languages of PLCs, whose blocks often work in shares of measuring ranges.
-_STRUCTURED_TEXT = "st"
 # The section of that file which no node has, for the names of topics.
 TOPICS = "/topics"
 

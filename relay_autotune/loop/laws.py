@@ -304,6 +304,7 @@ class Law:
     :param sign: what to know where its gains have not the sign of kc; ``{sign}`` is theirs.
     :param start: how it begins from the present command; None: its program has no way.
     :param ending: of the name of a file with its settings.
+    :param scale: what to know where its program scales the gains; empty: it does not.
     """
 
     name: str
@@ -329,6 +330,7 @@ class Law:
     sign: str = ""
     start: Start | None = None
     ending: str = "yaml"
+    scale: str = ""
 
     @property
     def sets_gains(self) -> bool:
@@ -586,6 +588,11 @@ def _strategy(name: str) -> Setting:
     return Setting("antiwindup_strategy", lambda law: name if law.gains.ti > 0.0 else "none")
 
 
+# Blocks of a PLC often work in shares of measuring ranges.
+_SHARES = (
+    "KP is in u/y: a block that scales to measuring ranges takes KP times the range of its "
+    "measurement over that of its command."
+)
 _TOOLBOX = "control_toolbox::Pid of ros-controls, 4.11.0 (branch jazzy)"
 _LATE = "u_k = p e_k + I_k + d (e_k - e_{k-1})/h, then I_{k+1} = I_k + i h e_k"
 _EARLY = "I_k = I_{k-1} + i h e_k, then u_k = p e_k + I_k + d (e_k - e_{k-1})/h"
@@ -832,6 +839,7 @@ void startController() {
             lambda law, command: -command / law.gains.kc,
         ),
         ending="st",
+        scale=_SHARES,
     ),
     Law(
         "oscat_ft_pid",
@@ -849,6 +857,7 @@ void startController() {
             "off the limits."
         ),
         ending="st",
+        scale=_SHARES,
     ),
 )
 

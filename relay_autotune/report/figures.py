@@ -47,9 +47,9 @@ from relay_autotune.report.style import (
     in_steps,
     legend,
     new_figure,
+    put_units,
     save,
     thinned,
-    told_in,
 )
 from relay_autotune.text import visible
 
@@ -328,7 +328,7 @@ class Plate:
         width = NARROW if narrow else WIDE if self.wide else SQUARE
         figure = new_figure(width, slim if narrow else broad)
         self.draw(case, figure, narrow=narrow)
-        told_in(figure, case.units)
+        put_units(figure, case.units)
         return figure
 
 
@@ -499,7 +499,7 @@ def draw_picture(case: Case, path: Path, *, title: str) -> None:
                 part.text(0.02, 0.5, text, color=MUTED, fontsize=10, wrap=True)
             else:
                 plates[key].draw(case, part, narrow=len(keys) > 1)
-    told_in(figure, case.units)
+    put_units(figure, case.units)
     save(figure, str(path))
 
 

@@ -116,7 +116,7 @@ def _environment() -> Environment:
         "known": math.isfinite,
         "plus_minus": plus_minus,
         "process_text": process_text,
-        "told_in": lambda text, units: Markup(in_units(text, units)),
+        "in_units": lambda text, units: Markup(in_units(text, units)),
         "mathml": lambda model: Markup(process_mathml(model)),
     }
     # What the page says of a case, each by the function that finds the words.

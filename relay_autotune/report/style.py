@@ -91,7 +91,7 @@ def finish(figure: Figure | SubFigure) -> None:
             label.set_fontsize(9.5)
 
 
-def told_in(figure: Figure, units: Mapping[str, str]) -> None:
+def put_units(figure: Figure, units: Mapping[str, str]) -> None:
     """Put the units of a loop into the labels of a figure.
 
     :param figure: with all that is to be drawn.

@@ -359,7 +359,7 @@ def test_names_given_for_several_apply_to_those_that_have_them(tmp_path, capsys,
     def read(paths, selection, progress=None):
         asked.append((Path(paths[0]).name, selection.measurement, selection.command))
         if paths[0].endswith("oven.csv") and selection.measurement == "PV":
-            raise NotThereError("oven.csv has no column 'PV'; its columns are a, b")
+            raise NotThereError("oven.csv has no column 'PV'", "its columns are a, b")
         raise BagError("no more")
 
     monkeypatch.setattr("relay_autotune.cli.jobs.read_experiments", read)

@@ -8,11 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from relay_autotune.analysis import _refusal
 from relay_autotune.errors import NotReadyError, RecordError
 from relay_autotune.exchange.messages import fill_reason, reason_from_message
 from relay_autotune.reasons import NONE, Code, Reason, joined, may_pass, other, reason_of
-from relay_autotune.record.record import Outcome, Record
 from tools.attribute_docs import attribute_docs
 
 MEANINGS = attribute_docs(Code)
@@ -96,11 +94,3 @@ def test_a_foreign_reason_has_a_sentence_whatever_it_holds(number):
     assert isinstance(found, Reason) and str(found).isprintable()
     assert found.code is (Code.OTHER if number == 65535 else Code.SILENT_SENSOR)
     assert found["a\\x1b[2J"] == "1\\n2"
-
-
-def test_a_defect_in_an_old_recording_is_told_once_with_what_to_do() -> None:
-    bare = "the node failed: ZeroDivisionError: float division by zero"
-    for told in (bare, str(Code.NODE_FAILED(error="ZeroDivisionError: float division by zero"))):
-        record = Record([0.0], [1.0], [2.0], outcome=Outcome.ABORTED, reason=told)
-        said = _refusal(record)
-        assert said.count("ZeroDivisionError") == said.count("tune again with its newest") == 1
