@@ -170,6 +170,8 @@ def reasons_table(first: int) -> str:
             head, _, last = whole.rpartition("; ")
             found = f"... {last}" if head and head == before else whole
             before = head
+            # What follows a colon is told again beside it.
+            found = re.sub(r": [^{}`]*$", "", found)
             cells = (f"{code} `{code.name}`", f"`{found}`", then)
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)

@@ -7,21 +7,11 @@ from __future__ import annotations
 
 import re
 
-import pytest
-from pages import ROOT, rows
+from pages import ROOT
 
-from relay_autotune.cli import report
 from relay_autotune.report.figures import PLATES
 
 PAGE = (ROOT / "docs/report.md").read_text()
-
-
-def test_the_page_has_every_flag(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        report.main(["--help"])
-    flags = set(re.findall(r"--[a-z-]+", capsys.readouterr().out.partition("\nEach source")[0]))
-    shown = " ".join(row[0] for row in rows("docs/report.md", "flag of `report`"))
-    assert set(re.findall(r"--[a-z-]+", shown)) | {"--help"} == flags
 
 
 def test_every_figure_has_a_section_with_its_picture() -> None:
