@@ -282,7 +282,11 @@ class _LoopOnPage:
         done = client.succeeded and bool(result.gains.experiment_id)
         self._gains.look_after_tune()
         live.forget_wishes()
-        live.rest("the tune is complete" if done else f"no gains: {result.reason}", good=done)
+        if left:
+            # What the plant does now matters more than the tune.
+            live.tell(window=())
+        ended = "; ".join(filter(None, (f"no gains: {result.reason}", left)))
+        live.rest("the tune is complete" if done else ended, good=done)
         return exit_status(found=done, doubtful=result.verdict == Verdict.DOUBTFUL)
 
     # The progress of a tune, see `follow`.

@@ -26,6 +26,8 @@ PLANT = {
     "noise_std": 0.005,
     "sample_period": 0.02,
 }
+# at rest at the command 1, which is not the one that is said
+MOVING = PLANT | {"time_constants": [0.4]}
 RELAY = {"amplitude": 0.5, "baseline": 1.0, "settle_time": 0.4, "measurement_timeout": 10.0}
 
 
@@ -244,3 +246,22 @@ def test_from_the_start_to_verified_gains_by_clicks(rig: Rig, tmp_path: Path) ->
         assert tab.said == other.said == []
     command.signal(signal.SIGINT)
     assert command.wait() == 0
+
+
+def test_after_a_failed_tune_the_page_says_how_the_plant_is_left_and_shows_what_it_does(
+    rig: Rig,
+) -> None:
+    rig.start("plant_node", "-r", "measurement:=/level", "-r", "command:=/valve", **MOVING)
+    words = ("--measurement", "/level", "--command", "/valve", "--at", "0.0")
+    limits = ("--within", "-40", "40", "--command-within", "-2", "5")
+    command = rig.start_command("tune_loop", *words, *limits, "--web", "--record-only")
+    found = rig.until(lambda: re.search(r"the page is at (\S+)", command.log), "the address")
+    page = OpenPage(found[1])
+    accepted(rig, page)
+    page.do("start")
+    rig.until(lambda: page.phase == "tuning", "a tune")
+    rig.until(lambda: page.phase == "idle", "its end")
+    assert "the command stands at 0 u, which is not the one" in page.told["status"]
+    assert page.told["window"] == []
+    command.signal(signal.SIGINT)
+    assert command.wait() == 1
