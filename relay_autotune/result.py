@@ -21,7 +21,7 @@ from relay_autotune.process.transfer_function import process_mathml, process_tex
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Cycle, Record
 from relay_autotune.text import digits, in_units, plus_minus
-from relay_autotune.tuning.ensemble import PredictedMs, ensemble_peaks
+from relay_autotune.tuning.ensemble import PredictedMs, ms_on_each
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import NOT_JUDGED, Finding, Judgement, Verdict, judge
 
@@ -61,7 +61,7 @@ class Shaping:
         law = self.task.law(gains)
         loop = Loop(
             controller=gains,
-            ms_of=lambda models: ensemble_peaks(law, self.task.set_of(models)).ms,
+            ms_of=lambda models: ms_on_each(law, self.task.set_of(models)),
             asked=max(self.task.options.ms, gains.ms),
             added_delay=self.task.options.added_delay,
             pace_asked=self.task.options.given_closed_loop_time is not None,

@@ -9,9 +9,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from relay_autotune.arrays import ComplexArray, FloatArray
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification
 from relay_autotune.loop.analysis import Loop
@@ -46,66 +45,20 @@ def ensemble(
     return tuple(identification.estimate.draws(count, rng))
 
 
-@dataclass(frozen=True)
-class Peaks:
-    """Robustness of one controller on many models.
-
-    :param ms: largest magnitude of the sensitivity function on each, infinite where the loop is
-        unstable, shape (m,).
-    :param mt: of the complementary sensitivity function, shape (m,).
-    """
-
-    ms: FloatArray
-    mt: FloatArray
-
-    @property
-    def unstable(self) -> int:
-        """How many of the loops are unstable."""
-        return int(np.isinf(self.ms).sum())
-
-
-def ensemble_peaks(law: ControlLaw, models: ModelSet) -> Peaks:
-    """Return the robustness of a controller on each of many models.
+def ms_on_each(law: ControlLaw, models: ModelSet) -> FloatArray:
+    """Return the Ms of a controller on each of many models, infinite where the loop is unstable.
 
     Stability follows from the number of turns of each loop on the grid; where two points are too
     far apart to count them, the argument principle decides.
 
     :param law: with its gains.
     :param models: at least one, as the law meets them.
+    :return: shape (m,).
     """
-    loops, distance, unstable = _loops(law, models)
-    ms, mt = 1.0 / distance.min(axis=0), (np.abs(loops) / distance).max(axis=0)
-    return Peaks(np.where(unstable, math.inf, ms), np.where(unstable, math.inf, mt))
-
-
-def ensemble_ms(law: ControlLaw, models: ModelSet) -> float:
-    """Return the Ms that 95 % of the models do not exceed with one controller.
-
-    :param law: with its gains.
-    :param models: at least one, as the law meets them.
-    :raises TuningError: if more than 5 % of the loops are unstable.
-    """
-    _, distance, unstable = _loops(law, models)
-    ms, count = np.where(unstable, math.inf, 1.0 / distance.min(axis=0)), len(models.models)
-    value = float(np.sort(ms)[count - 1 - allowed_outside(count)])
-    if math.isinf(value):
-        raise TuningError(
-            "the model is too uncertain for these gains: "
-            f"{100 * unstable.sum() / count:.0f} % of the models within its uncertainty "
-            "would be unstable; run more cycles or a larger amplitude"
-        )
-    return value
-
-
-def _loops(
-    law: ControlLaw, models: ModelSet
-) -> tuple[ComplexArray, FloatArray, NDArray[np.bool_]]:
-    """Return loops L and |1 + L| on a grid, shape (n, m), and which are unstable, shape (m,)."""
     grid = Loop(law, models.models[0]).grid
     # At the first frequency all dynamics except integrators are at rest.
     w = np.concatenate(([1e-6 * grid[0]], grid))
-    loops = law(1j * w)[:, None] * models.at(w)
-    moved = 1.0 + loops
+    moved = 1.0 + law(1j * w)[:, None] * models.at(w)
     if law.period > 0.0:
         end = np.array([1j * math.pi / law.period])
         limits = (law(end) * models(end))[0].real
@@ -115,11 +68,29 @@ def _loops(
     count = winding(moved, w, models.unstable_poles, integrators, limits, law.period)
     for k in np.flatnonzero(np.isnan(count)):
         count[k] = Loop(law, models.models[k]).unstable_poles
-    return loops[1:], np.abs(moved[1:]), count != 0.0
+    return np.where(count == 0.0, 1.0 / np.abs(moved[1:]).min(axis=0), math.inf)
 
 
 def _at_infinity(law: ControlLaw, model: TransferFunction) -> float:
     return 0.0 if model.dead_time > 0.0 else at_infinity(law.characteristic(model)[-1])
+
+
+def ensemble_ms(law: ControlLaw, models: ModelSet) -> float:
+    """Return the Ms that 95 % of the models do not exceed with one controller.
+
+    :param law: with its gains.
+    :param models: at least one, as the law meets them.
+    :raises TuningError: if more than 5 % of the loops are unstable.
+    """
+    ms = ms_on_each(law, models)
+    value = float(np.sort(ms)[ms.size - 1 - allowed_outside(ms.size)])
+    if math.isinf(value):
+        raise TuningError(
+            "the model is too uncertain for these gains: "
+            f"{100 * np.isinf(ms).mean():.0f} % of the models within its uncertainty "
+            "would be unstable; run more cycles or a larger amplitude"
+        )
+    return value
 
 
 @dataclass(frozen=True)
@@ -153,7 +124,7 @@ def predicted_ms(task: DesignTask, rule: Rule) -> PredictedMs | None:
     except TuningError:
         return None
     models = task.set_of((task.model, *task.models))
-    own, *others = ensemble_peaks(task.law(controller), models).ms
+    own, *others = ms_on_each(task.law(controller), models)
     # No interpolation: some values may be infinite.
     low, high = np.quantile(others, (0.025, 0.975), method="closest_observation")
     return PredictedMs(float(own), float(low), float(high))

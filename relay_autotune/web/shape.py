@@ -33,7 +33,7 @@ from relay_autotune.report.frequency import (
 )
 from relay_autotune.result import Shaping
 from relay_autotune.tuning import DEFAULT_RULE, Designed, designed, judged
-from relay_autotune.tuning.ensemble import ensemble_peaks
+from relay_autotune.tuning.ensemble import ms_on_each
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict
 
@@ -336,8 +336,8 @@ def _shaped(
     loop, steady = task.loop(gains), np.empty(0, dtype=bool)
     unstable = 0
     if task.models:
-        peaks = ensemble_peaks(loop.law, task.around)
-        unstable, steady = peaks.unstable, peaks.ms < math.inf
+        steady = np.isfinite(ms_on_each(loop.law, task.around))
+        unstable = int(np.sum(~steady))
     return DesignResult(
         asked,
         gains,
