@@ -17,7 +17,7 @@ import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.limit_cycle.fold import LEAST_CYCLES, switched_at
+from relay_autotune.identification.limit_cycle.fold import LEAST_CYCLES
 from relay_autotune.identification.limit_cycle.limit_cycle import RelayTest
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
@@ -99,37 +99,17 @@ def _polygon(angle: FloatArray) -> tuple[ComplexArray, ComplexArray]:
     return level, 0.5 * level - 1j * odd * middle
 
 
-def cycle_ends(record: Record, first: int = 0) -> FloatArray:
-    """Return when the whole cycles of a record begin, and when the last one ends [s].
-
-    These are the instants at which the command switched, not the samples beside them.
-
-    :param record: with at least one whole cycle after ``first``.
-    :param first: cycles left out at the beginning.
-    :return: shape (cycles + 1,).
-    :raises IdentificationError: if no whole cycle is left.
-    """
-    bounds = record.cycle_start[first:]
-    if len(bounds) < 2:
-        raise IdentificationError(
-            f"the record holds {max(len(record.cycle_start) - 1, 0)} whole cycles, of which "
-            f"{first} are left out; at least one is needed: let the relay switch longer"
-        )
-    return switched_at(record, bounds)
-
-
-def frequency_point(record: Record, harmonic: int = 1, first: int = 0) -> FrequencyPoint:
+def frequency_point(record: Record, ends: FloatArray, harmonic: int = 1) -> FrequencyPoint:
     """Return one point of the frequency response from a limit cycle (Wang et al. 1997, eq 23).
 
     ``G(j k w0) = int y exp(-j k w0 t) dt / int u exp(-j k w0 t) dt`` over whole cycles; exact in
     the limit cycle, whatever the process.
 
     :param record: with whole cycles.
+    :param ends: when they begin, and when the last one ends [s], shape (cycles + 1,).
     :param harmonic: k; odd, or the command of an unbiased relay holds nothing there.
-    :param first: cycles left out at the beginning, while the limit cycle settles.
-    :raises IdentificationError: if no whole cycle is left or the command lacks the harmonic.
+    :raises IdentificationError: if the command lacks the harmonic.
     """
-    ends = cycle_ends(record, first)
     start, end = float(ends[0]), float(ends[-1])
     w = harmonic * 2.0 * math.pi * (ends.size - 1) / (end - start)
     u = record.input()
@@ -236,7 +216,7 @@ def static_gain(test: RelayTest, rest: SteadyState) -> StaticGain:
         away = mean_u - settings.baseline
         return (mean_y - rest.value) / away if away else math.inf, away
 
-    ends = cycle_ends(record)
+    ends = test.ends
     value, excursion = ratio(float(ends[0]), float(ends[-1]))
     if abs(excursion) < _LEAST_BIAS * settings.amplitude:
         raise IdentificationError(
@@ -282,14 +262,14 @@ def measured_points(test: RelayTest) -> Points:
             f"samples; Fourier integrals need at least {2.0 * math.pi / _COARSEST:.0f}: sample "
             "faster, or use the method waveform"
         )
-    first, last = record.cycle_start[0], record.cycle_start[-1]
+    first, last = test.bounds[0], test.bounds[-1]
     # White noise in n samples h apart has integrals whose parts have the variance std^2 h^2 n/2.
     part = record.noise * interval * math.sqrt(0.5 * (last - first))
     found = []
     for harmonic in range(1, int(_COARSEST / (fundamental * interval)) + 1)[:_MOST]:
         # The command of a symmetric relay holds nothing at the even ones.
         with suppress(IdentificationError):
-            found.append(frequency_point(record, harmonic))
+            found.append(frequency_point(record, test.ends, harmonic))
     if not found:
         raise IdentificationError(
             "the command holds nothing at the frequency of its cycles: they are not bounded by "
@@ -312,11 +292,10 @@ def with_noise_about(model: TransferFunction, test: RelayTest, points: Points) -
     :raises IdentificationError: if the point at the frequency of the limit cycle is not.
     """
     record = test.record
-    ends = cycle_ends(record)
-    start, end, cycles = float(ends[0]), float(ends[-1]), ends.size - 1
+    start, end, cycles = float(test.ends[0]), float(test.ends[-1]), test.ends.size - 1
     if cycles < 2:
         return points
-    inside = slice(record.cycle_start[0], record.cycle_start[-1] + 1)
+    inside = slice(test.bounds[0], test.bounds[-1] + 1)
     time = record.time[inside]
     left = record.measurement[inside] - response(model, time, record.input())
     left = left - np.polyval(np.polyfit(time - time[0], left, 1), time - time[0])
@@ -342,11 +321,11 @@ def _certain(test: RelayTest, points: Sequence[FrequencyPoint], parts: Sequence[
     :param parts: standard deviations of the parts of the measurement's integrals [y s].
     :raises IdentificationError: if the lowest one is too uncertain.
     """
-    ends, u = cycle_ends(test.record), test.record.input()
+    u, (start, *_, end) = test.record.input(), test.ends.tolist()
     found = []
     for point, part in zip(points, parts, strict=True):
         w, size = point.frequency, abs(point.value)
-        noise = part / abs(fourier_integral_held(u, float(ends[0]), float(ends[-1]), w))
+        noise = part / abs(fourier_integral_held(u, start, end, w))
         chord = _POLYGON * (w * test.record.interval) ** 2 * size
         std = math.hypot(noise, chord)
         if not std > _TOO_UNCERTAIN * size:

@@ -5,16 +5,16 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.limit_cycle.fold import NO_BIAS, SYMMETRIC
+from relay_autotune.identification.limit_cycle.fold import NO_BIAS, SYMMETRIC, switched_at
 from relay_autotune.record.cycles import (
     LimitCycle,
     cycles_of,
@@ -38,17 +38,22 @@ class RelayTest:
     """A relay test for the methods that need a limit cycle only.
 
     :param method: on whose behalf it is read, for messages.
-    :param whole: the record.
-    :param record: the same, whose ``cycle_start`` bounds the cycles that agree alone.
+    :param record: the record.
     :param settings: the relay, inferred where the record does not have it.
     :param cycle: averages over the cycles that agree.
+    :param bounds: samples at which these begin, and at which the last one ends.
     """
 
     method: str
-    whole: Record
     record: Record
     settings: RelaySettings
     cycle: LimitCycle
+    bounds: tuple[int, ...]
+
+    @cached_property
+    def ends(self) -> FloatArray:
+        """When the cycles that agree begin, and when the last one ends [s], shape (n + 1,)."""
+        return switched_at(self.record, self.bounds)
 
     @property
     def sign(self) -> int:
@@ -113,7 +118,8 @@ def relay_test(method: str, record: Record, *, two_levels: bool = True) -> Relay
             "use the method waveform, which takes any input"
         )
     average = limit_cycle(cycles)
-    samples = (bounds[average.cycles[-1] + 1] - bounds[average.cycles[0]]) / len(average.cycles)
+    bounds = bounds[average.cycles[0] : average.cycles[-1] + 2]
+    samples = (bounds[-1] - bounds[0]) / len(average.cycles)
     if samples < _LEAST_SAMPLES or not average.period > 0.0:
         raise IdentificationError(
             f"a cycle of {average.period:g} s holds {samples:.3g} samples; {method} needs at "
@@ -124,23 +130,10 @@ def relay_test(method: str, record: Record, *, two_levels: bool = True) -> Relay
             "the measurement is constant while the relay switches: check the sensor, the "
             "actuator and that both topics belong to one loop"
         )
-
-    u = record.input()
     if two_levels:
-        ends = bounds[average.cycles[0]], bounds[average.cycles[-1] + 1]
-        _require_two_levels(method, settings, u, record.time[list(ends)])
-
-    # A copy that shares the columns, which are many and read-only; not what the other remembers.
-    part = copy.copy(record)
-    steady = bounds[average.cycles[0] : average.cycles[-1] + 2]
-    for name, value in (
-        ("settings", settings),
-        ("cycle_start", steady),
-        ("held_input", u),
-        ("answers", {}),
-    ):
-        object.__setattr__(part, name, value)
-    return RelayTest(method, record, part, settings, average)
+        span = record.time[[bounds[0], bounds[-1]]]
+        _require_two_levels(method, settings, record.input(), span)
+    return RelayTest(method, record, settings, average, bounds)
 
 
 def _require_two_levels(

@@ -79,8 +79,8 @@ def read_dead_time(test: RelayTest, known: Known) -> tuple[float, float, str]:
     if not math.isnan(known.dead_time):
         return known.dead_time, 0.0, ""
     settings, cycles = test.settings, test.cycle.cycles
-    if _is_sharp(fold(test.whole, cycles)):
-        edge = Reading.of(test.whole, cycles, lambda seen: np.array([seen.edge]))
+    if _is_sharp(fold(test.record, cycles)):
+        edge = Reading.of(test.record, cycles, lambda seen: np.array([seen.edge]))
         value = max(float(edge.values[0]) - settings.extra_delay, 0.0)
         source = (
             f"the dead time of {value:.4g} s was read as the time from the switch to the sharp "
@@ -90,7 +90,7 @@ def read_dead_time(test: RelayTest, known: Known) -> tuple[float, float, str]:
         between = test.record.interval / math.sqrt(12.0 * len(cycles))
         scatter = float(np.nan_to_num(edge.std[0]))
         return value, max(scatter, between), source
-    first, interval = _first_response(test.whole, settings)
+    first, interval = _first_response(test.record, settings)
     if math.isnan(first):
         raise IdentificationError(
             "the dead time is not known, and neither sharp peaks nor a first kick from rest show "
@@ -270,7 +270,7 @@ def seen_in(test: RelayTest, dead_time: float = 0.0, std: float = 0.0, source: s
         low, high = seen.peaks()
         return np.array((seen.period, 0.5 * (high - low), level_at_switch(seen), 0.0))
 
-    read = Reading.of(test.whole, test.cycle.cycles, measure)
+    read = Reading.of(test.record, test.cycle.cycles, measure)
     # In noise the level may be below zero, where no relay switches.
     read.values[2] = min(max(read.values[2], 0.0), _MOST_LEVEL * read.values[1])
     read = read.with_number(3, dead_time + test.settings.extra_delay, std)
@@ -497,6 +497,6 @@ def shape_misfit(
     half = 0.5 * cycle.period
     time = half * (np.arange(_SHAPE_POINTS) + 0.5) / _SHAPE_POINTS
     process = model.build((*solution, cycle.dead_time))
-    seen = fold(test.whole, test.cycle.cycles)
+    seen = fold(test.record, test.cycle.cycles)
     away = HalfCycle(process, half, cycle.relay)(time) - seen.half(time)
     return math.hypot(float(np.sqrt(np.mean(away**2))), seen.noise_std) / cycle.amplitude
