@@ -14,6 +14,7 @@ from scipy.linalg import expm
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop, analyse_loop
 from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate
 from relay_autotune.loop.sampled import (
     Limits,
     SampledPid,
@@ -21,7 +22,7 @@ from relay_autotune.loop.sampled import (
     simulate_closed_loop,
 )
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.candidates import open_noise_gain
+from relay_autotune.tuning.candidates import filters_of
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 PI, PID = Controller(0.67, 21.1), Controller(0.7, 16.0, 3.7, 0.37, 0.6)
@@ -110,12 +111,12 @@ def test_the_filter_moves_as_the_matrix_exponential_has_it(tf):
 
 @pytest.mark.parametrize("ratio", [300.0, 9000.0])
 def test_a_slow_filter_leaves_the_noise_of_its_bandwidth(ratio):
-    period = 0.1
-    tf, td = np.array([ratio * period]), np.array([0.0, 1e3]) * ratio * period
+    rate = LawRate(LAWS[OWN_LAW], 0.1)
+    tf, td = np.full(2, ratio * rate.period), np.array([0.0, 1e3]) * ratio * rate.period
     # Integrals of |F(jw)|^2 and |w F(jw)|^2 with F = 1/(1 + tf s + (tf s)^2/2).
     exact = np.sqrt((0.5 + np.array([0.0, 1e6])) / ratio)
-    # Between the entries of the table it is off by up to 1 %.
-    assert open_noise_gain(td, tf, period) == pytest.approx(exact, rel=0.012)
+    # Between the entries of the table the noise is off by up to 1 %.
+    assert filters_of(rate, td, exact, math.inf) == pytest.approx(tf, rel=0.024)
 
 
 def test_a_period_or_limits_without_sense_are_refused():
