@@ -159,18 +159,6 @@ def gains_lines(
     return _laid_out([rule, isa, *further, *rest], width)
 
 
-_FIGURES = (
-    ("kc", "u/y"), ("ti", "s"), ("td", "s"), ("tf", "s"), ("b", ""),
-)  # fmt: skip
-# What a loop does, by the fields of `Performance`.
-_EFFECTS = (
-    ("Ms", "ms", ""),
-    ("error after a load step", "iae_load", "y s/u"),
-    ("overshoot", "overshoot", ""),
-    ("settling time", "settling_time", "s"),
-)
-
-
 def beside(
     present: Controller | None,
     gains: Gains,
@@ -188,26 +176,17 @@ def beside(
     :param head: what stands above the present gains.
     :param added_delay: as of `performance_beside`.
     """
-    # here, for it loads scipy: a tune is shown with this module, and begins before that
+    # here, for they load scipy: a tune is shown with this module, and begins before that
     from relay_autotune.loop.analysis import difference, performance_beside
+    from relay_autotune.report.findings import compared_numbers
 
     now = None if present is None else performance_beside(present, gains, model, added_delay)
-    rows = [["", head, "new", ""]]
-    for name, unit in _FIGURES:
-        old = "none" if present is None else digits(getattr(present, name))
-        rows.append([name, old, digits(getattr(gains, name)), unit])
-    for label, name, unit in _EFFECTS:
-        told = "-" if present is None else "unstable" if now is None else _number(now, name)
-        rows.append([label, told, _number(gains, name), unit])
-    lines = in_columns(rows, width)
+    both = zip(compared_numbers(present, now), compared_numbers(gains, gains), strict=True)
+    rows = [(name, old, new, unit) for (name, old, unit, _), (_, new, _, _) in both]
+    lines = in_columns([("", head, "new", ""), *rows], width)
     if present is not None:
         lines += labelled("compared", difference(now, gains), width)
     return lines
-
-
-def _number(found: Performance, name: str) -> str:
-    value = getattr(found, name)
-    return f"{100.0 * value:.0f} %" if name == "overshoot" else digits(value, 3)
 
 
 def _laid_out(entries: Sequence[_Entry], width: int) -> list[str]:

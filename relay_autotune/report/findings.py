@@ -81,20 +81,21 @@ class NamedNumber:
     text: str
 
 
-@dataclass(frozen=True)
-class Row:
-    """A number of the present gains beside that of the new ones.
-
-    :param name: what it is, with its unit.
-    :param present: of the present gains, as text.
-    :param new: of the new gains.
-    :param meaning: what to make of it.
-    """
-
-    name: str
-    present: str
-    new: str
-    meaning: str
+# By what present gains are compared with new ones: names, fields, units and meanings.
+_NUMBERS = (("kc", "u/y"), ("ti", "s"), ("td", "s"), ("tf", "s"), ("b", ""))
+_EFFECTS = (
+    ("Ms", "ms", "", "below 1.4 careful, above 2 risky"),
+    (
+        "error after a load step",
+        "iae_load",
+        "y s/u",
+        "the smaller, the sooner it is over",
+    ),
+    ("overshoot", "overshoot", "", "after a step of the set-point"),
+    ("settling time", "settling_time", "s", "after a step of the set-point"),
+)
+# Name, value and unit of a number of gains, and what it means.
+Compared = tuple[str, str, str, str]
 
 
 def verdict_of(case: Case) -> Chip:
@@ -156,20 +157,16 @@ def steps_of(case: Case) -> tuple[str, ...]:
     return steps
 
 
-def beside_present(case: Case) -> tuple[Row, ...]:
-    """Return the present gains beside the new ones, with what both do on the model.
+def beside_present(case: Case) -> list[tuple[Compared, Compared]]:
+    """Return each number of the present gains with that of the new ones, both on the model.
 
-    :param case: the experiment; no rows where a model, gains or the present gains are missing.
+    :param case: the experiment; nothing where a model, gains or the present gains are missing.
     """
     new, present = case.best_gains, case.present
     if case.model is None or new is None or present is None:
-        return ()
+        return []
     old = compared_numbers(present, performance_of(present, case))
-    then = compared_numbers(new, new)
-    return tuple(
-        Row(name, value, other, meaning)
-        for (name, value, meaning), (_, other, _) in zip(old, then, strict=False)
-    )
+    return list(zip(old, compared_numbers(new, new), strict=True))
 
 
 def change_of(case: Case) -> str:
@@ -193,34 +190,23 @@ def performance_of(present: Controller, case: Case) -> Performance | None:
     return performance_beside(present, case.best_gains, case.model.found.model, case.added_delay)
 
 
-def compared_numbers(gains: Controller, does: Performance | None) -> list[tuple[str, str, str]]:
-    """Return the names, values and meanings by which gains are compared.
+def compared_numbers(gains: Controller | None, does: Performance | None) -> list[Compared]:
+    """Return the numbers by which gains are compared.
 
-    :param gains: the gains.
+    :param gains: the gains; None: there are none.
     :param does: what they do on the model; None: they make the loop unstable.
     """
-    rows = [
-        ("kc [u/y]", digits(gains.kc), ""),
-        ("ti [s]", digits(gains.ti), ""),
-        ("td [s]", digits(gains.td), ""),
-    ]
-    if does is None:
-        return [*rows, ("Ms", "-", "the present gains make the loop unstable on the model")]
+
+    def effect(name: str) -> str:
+        if gains is None or does is None:
+            return "-" if gains is None else "unstable"
+        value = getattr(does, name)
+        return f"{100.0 * value:.0f} %" if name == "overshoot" else digits(value, 3)
+
+    numbers = ((n, digits(getattr(gains, n)) if gains else "none", unit) for n, unit in _NUMBERS)
     return [
-        *rows,
-        ("Ms", digits(does.ms, 3), "below 1.4 careful, above 2 risky"),
-        (
-            "phase margin [deg]",
-            digits(math.degrees(does.phase_margin), 3),
-            "the larger, the calmer",
-        ),
-        (
-            "IAE after a load step [y s/u]",
-            digits(does.iae_load, 3),
-            "the smaller, the faster a load is compensated",
-        ),
-        ("overshoot [%]", digits(100.0 * does.overshoot, 3), "after a step of the set-point"),
-        ("settles in [s]", digits(does.settling_time, 3), "after a step of the set-point"),
+        *((*each, "") for each in numbers),
+        *((label, effect(name), unit, meaning) for label, name, unit, meaning in _EFFECTS),
     ]
 
 
