@@ -156,7 +156,8 @@ class Polar:
         return float(self._parts(np.array([place]))[1][0])
 
 
-_MOST_POINTS = 200_000
+# Step of the dead time's angle [rad], and how often a maximum is looked at closer.
+_TURN, _ZOOMS = 0.3, 6
 
 
 @dataclass(frozen=True)
@@ -250,17 +251,44 @@ def _crossings(model: TransferFunction) -> list[_Crossing]:
     found += first
     if not first or not polar.delayed:
         return found
-    # Later turns of the dead time matter only if the magnitude is larger again.
-    least = -math.log(min(c.gain for c in first))
     last = math.log(first[-1].frequency)
-    beyond = np.append(last, logarithms[logarithms > last])
-    sizes = polar.size(beyond)
-    if bool(np.all(np.diff(sizes) <= 0.0)):
-        return found
+    least = -math.log(min(c.gain for c in first))
+    for low, high in _summits(polar, logarithms, last + 1e-9, least):
+        found += _scan(polar, _grid(polar, logarithms, low, high))
+    return found
+
+
+def _summits(
+    polar: Polar, logarithms: FloatArray, low: float, least: float
+) -> list[tuple[float, float]]:
+    """Return the ranges of log frequency where later turns of the dead time matter.
+
+    They matter only where the magnitude is larger again. About each of its maxima there are then
+    turns that bring more pairs of poles to the right than ever go back, each at a smaller gain
+    than the turns further off.
+
+    :param low: log frequency from which on turns are looked for.
+    :param least: log of the largest magnitude before.
+    """
+    place = np.append(low, logarithms[logarithms > low])
+    size = np.concatenate(([math.inf], polar.size(place), [-math.inf]))
+    highest = (size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:])
     # Between two points of the grid it may be a little larger than at either.
-    higher = beyond[1:][sizes[1:] > least - 1e-3]
-    if higher.size:
-        found += _scan(polar, _grid(polar, logarithms, last + 1e-9, float(higher[-1]) + 0.1))
+    highest &= size[1:-1] > least - 1e-3
+    found: list[tuple[float, float]] = []
+    for k in np.flatnonzero(highest).tolist():
+        near = place[max(k - 1, 0) : k + 2]
+        for _ in range(_ZOOMS):
+            near = np.linspace(near[0], near[-1], 33)
+            k = int(np.argmax(polar.size(near)))
+            at, near = float(near[k]), near[max(k - 1, 0) : k + 2]
+        angle = math.exp(min(at + polar.log_delay, 700.0))
+        away = (polar.roots + 4) * 2.0 * math.pi / _TURN * _step(angle)
+        begin = max(math.log(max(angle - away, 1e-300)) - polar.log_delay, low)
+        end = math.log(angle + away) - polar.log_delay
+        if found and begin <= found[-1][1]:
+            begin, _ = found.pop()
+        found.append((begin, end))
     return found
 
 
@@ -286,10 +314,17 @@ def _grid(polar: Polar, logarithms: FloatArray, low: float, high: float) -> Floa
     if polar.delayed:
         # In angles of the dead time, which are independent of the unit of time.
         begin, end = (math.exp(min(edge + polar.log_delay, 700.0)) for edge in (low, high))
-        count = int(min((end - begin) / 0.3 + 2.0, _MOST_POINTS))
-        angles = np.linspace(begin, end, count)
+        angles = np.linspace(begin, end, int((end - begin) / _step(end) + 2.0))
         parts.append(np.log(angles[1:-1]) - polar.log_delay)
     return np.unique(np.concatenate(parts))
+
+
+def _step(angle: float) -> float:
+    """Return how far apart angles of the dead time are looked at [rad].
+
+    Far out the turns are closer than rounding; the magnitude is the same at all of them.
+    """
+    return max(_TURN, 1e-12 * angle)
 
 
 def _scan(polar: Polar, grid: FloatArray) -> list[_Crossing]:

@@ -155,7 +155,9 @@ class Responses:
         )
 
     def _evaluate(self, grid: FloatArray) -> ComplexArray:
-        values = self._sign / self._set(1j * grid.astype(np.float64)).T
+        through = self._set(1j * grid.astype(np.float64)).T
+        values = np.full(through.shape, complex(math.inf, 0.0))
+        np.divide(self._sign, through, out=values, where=through != 0.0)
         return np.ascontiguousarray(values.astype(np.result_type(grid, np.complex64)))
 
     def _keep(self, grid: FloatArray, inverse: ComplexArray) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop, abscissae, inverted
 from relay_autotune.loop.gains import Controller
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.candidates import (
     Optimum,
 )
@@ -69,7 +70,10 @@ def robust(task: DesignTask) -> tuple[Controller, str]:
         derivative = options.controller == "pid" and search.differentiates
         found = _within(search, bounds, derivative) or _relaxed(search, bounds, derivative)
         controller, reason = found.optimum.controller, _promise(found, search)
-    if controller.i == 0.0 or not math.isfinite(controller.i):
+    # Where a double cannot count the samples of a response, the integral is as good as zero.
+    duration = _duration(controller, search.model, search.frequency)
+    endless = duration * math.ulp(1.0) > search.rate.period > 0.0
+    if endless or not (math.isfinite(controller.i) and math.isfinite(duration)):
         raise TuningError(
             "no controller with a gain above zero keeps the bounds on the model and those around "
             "it: it is not known well enough; record a longer or larger test"
@@ -198,6 +202,16 @@ def _promise(attempt: _Attempt, search: Search) -> str:
     return "; ".join((promise, *attempt.warnings))
 
 
+def _duration(controller: Controller, model: TransferFunction, frequency: float) -> float:
+    """Return the time in which a loop answers to its set-point [s]; infinite: never."""
+    if controller.i == 0.0:
+        return math.inf
+    reset = controller.ti
+    if model.is_stable:
+        reset += 1.0 / abs(controller.i) / abs(model.gain)
+    return _RESETS * reset + _TURNS * 2.0 * math.pi / frequency
+
+
 def with_setpoint_weight(controller: Controller, loop: Loop, frequency: float) -> Controller:
     """Return the controller with the largest weight b without unnecessary overshoot.
 
@@ -209,10 +223,7 @@ def with_setpoint_weight(controller: Controller, loop: Loop, frequency: float) -
     :param loop: its loop with the process.
     :param frequency: about which the loop is closed [rad/s].
     """
-    model, reset = loop.model, controller.ti
-    if model.is_stable:
-        reset += 1.0 / abs(controller.i * model.gain)
-    duration = _RESETS * reset + _TURNS * 2.0 * math.pi / frequency
+    model, duration = loop.model, _duration(controller, loop.model, frequency)
     at = abscissae(duration, _POINTS)
     through = model(at) / (at * (1.0 + loop(at)))
     proportional = inverted(controller.kc * through, duration)

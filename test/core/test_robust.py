@@ -257,3 +257,19 @@ def test_a_grid_of_one_frequency_shows_no_crossing():
     """Far above half of the sampling rate a loop has no other frequency."""
     found = first_crossing(np.ones((1, 4, 1)), np.ones((1, 4, 1)), np.ones(1))
     np.testing.assert_array_equal(found, np.full((1, 4), math.inf))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_process_of_which_no_sample_shows_anything_gets_no_gains():
+    """All that it does after a step is over within a fiftieth of a sampling period.
+
+    A noise gave this model; the search divided by its response of zero.
+    """
+    lag, period = (3.489e-5,) * 4, 2.02e-3
+    model = TransferFunction(-1.356e-11, (9.017e12,), lag, dead_time=8.86)
+    # Only what begins just before a sample is not over there.
+    parts = (0.07, 0.93, 0.0, 0.78, 0.12, 0.88, 0.9975, 0.0, 0.19, 0.81)
+    around = tuple(replace(model, dead_time=(4386 + part) * period) for part in parts)
+    task = DesignTask(model=model, models=around, options=DesignOptions(sample_period=period))
+    with pytest.raises(TuningError, match="not known well enough"):
+        robust(task)

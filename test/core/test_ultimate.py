@@ -16,7 +16,7 @@ from worked_cases import PROCESSES, cases
 from relay_autotune.loop.stability import closed_loop_unstable_poles
 from relay_autotune.process.structures import IPDT, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.process.ultimate import Polar, ultimate_point
 
 
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.T1"))
@@ -181,3 +181,29 @@ def test_a_dead_time_beyond_any_lag_is_no_slower():
     point = ultimate_point(TransferFunction.fopdt(2.0, 1e-9, 1.0))
     assert point.gain == pytest.approx(0.5, rel=1e-9)
     assert point.frequency == pytest.approx(math.pi, rel=1e-8)
+
+
+@pytest.mark.parametrize("dead_time", [1.0, 1e3, 1e6, 1e12, 1e18])
+def test_turns_of_a_dead_time_are_looked_at_where_the_process_passes_most(monkeypatch, dead_time):
+    """A noise gave a model with a million turns before its maximum, and 100 such took 90 s."""
+    lead, lag, points = 10.0, 0.1, 0
+    evaluate = Polar.turns
+
+    def counted(self, place, whole=0.0):
+        nonlocal points
+        points += np.size(place)
+        return evaluate(self, place, whole)
+
+    monkeypatch.setattr(Polar, "turns", counted)
+    point = ultimate_point(
+        TransferFunction(1.0, zeros=(lead,), time_constants=(lag, lag), dead_time=dead_time)
+    )
+    # |G|^2 = (1 + a x)/(1 + b x)^2 with x = w^2
+    a, b = lead**2, lag**2
+    x = (a - 2.0 * b) / (a * b)
+    largest = math.sqrt(1.0 + a * x) / (1.0 + b * x)
+    # The turns are 2 pi/D apart, and the nearest one passes hardly less.
+    off = 0.5 * (math.pi / dead_time) ** 2 / x
+    assert 1.0 - 1e-12 <= point.gain * largest <= 1.0 + 2.0 * off + 1e-12
+    assert point.frequency == pytest.approx(math.sqrt(x), rel=1e-3, abs=2.0 * math.pi / dead_time)
+    assert points < 100_000
