@@ -83,27 +83,19 @@ def table(entries: Iterable[Quantity]) -> str:
 
     :param entries: the parameters.
     """
-    lines = ["| parameter | default | unit | range | what it is |", "|---|---|---|---|---|"]
+    lines = ["| parameter | default, unit, range | what it is |", "|---|---|---|"]
     for entry in entries:
-        cells = (
-            f"`{entry.name}`",
-            default_text(entry.default),
-            entry.unit,
-            _short(entry),
-            entry.description,
-        )
-        lines.append(f"| {' | '.join(cells)} |".replace("|  |", "| |"))
+        value = f"{default_text(entry.default)} {entry.unit}".strip()
+        told = ", ".join(filter(None, (value, _short(entry))))
+        lines.append(f"| `{entry.name}` | {told} | {entry.description} |")
     return "\n".join(lines)
 
 
 def _short(entry: Quantity) -> str:
-    """Return the range of a parameter without its unit, which has a column of its own."""
+    """Return the range of a parameter without its unit; empty: any number."""
     text = entry.range_text.replace(f" [{entry.unit}]", "").replace(" where it is not given", "")
-    return (
-        text.replace("any number", "any")
-        .replace(f" {entry.unit},", ",")
-        .removesuffix(f" {entry.unit}")
-    )
+    text = text.replace(f" {entry.unit},", ",").removesuffix(f" {entry.unit}")
+    return "" if text.startswith("any number") else text
 
 
 def checks_table(checks: Iterable[Check]) -> str:
