@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.tuning.search import load_iaes
+from relay_autotune.tuning.frontier import Candidates
+from relay_autotune.tuning.search import Search
 
 FloatArray = NDArray[np.float64]
 
@@ -115,7 +116,7 @@ def best_on_a_grid(
         points, kp, ti, td = points[kept], kp[kept], ti[kept], td[kept]
         if kp.size:
             tf = td / judge.filter_ratio
-            iaes = load_iaes(model, kp, kp / ti, td, tf, _frequency(model))
+            iaes = Search(model).iaes(Candidates(kp, kp / ti, td, tf))
             k = int(np.argmin(iaes))
             if iaes[k] < least:
                 best, least = points[k], float(iaes[k])

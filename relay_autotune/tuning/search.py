@@ -50,37 +50,6 @@ _TURNED = 0.1
 _FAST = 25.0
 
 
-def load_iaes(
-    model: TransferFunction,
-    kp: FloatArray,
-    ki: FloatArray,
-    td: FloatArray,
-    tf: FloatArray,
-    frequency: float,
-) -> FloatArray:
-    """Return the IAE of a unit step of the load for each controller [y s/u].
-
-    :param model: the process.
-    :param kp: proportional gains, positive, of stable loops, shape (k,).
-    :param ki: integral gains, shape (k,).
-    :param td: derivative times [s], shape (k,).
-    :param tf: time constants of the filter [s], shape (k,).
-    :param frequency: at which loops of this process oscillate if at all [rad/s].
-    """
-    reset = kp / ki
-    if model.is_stable:
-        # With a small gain the response is that of the integral alone.
-        reset = reset + 1.0 / (ki * abs(model.gain))
-    duration = (_RESETS * reset + _TURNS * 2.0 * math.pi / frequency)[:, None]
-    s = abscissae(duration, _POINTS)
-    p, i, d, f = (values[:, None] for values in (kp, ki, td, tf))
-    process = model.process_sign * model(s)
-    controller = (p * (1.0 + d * s) + i / s) / (1.0 + f * s + 0.5 * (f * s) ** 2)
-    y = inverted(process / (s * (1.0 + controller * process)), duration)
-    step = duration[:, 0] / _POINTS
-    return np.asarray(1.0 / ki + 2.0 * step * np.maximum(-y, 0.0).sum(axis=1))
-
-
 _SHRINK, _GROW = 0.5, 1.5
 _ON_A_LINE = np.array([-1.0, -0.5, -0.25, -0.125, 0.125, 0.25, 0.5, 1.0])
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
@@ -462,11 +431,11 @@ class Search:
         """
         order = np.argsort(-scanned.ki)
         first, rest = order[:_TRIED_AT_ONCE], order[_TRIED_AT_ONCE:]
-        iaes = self._iaes(scanned[first])
+        iaes = self.iaes(scanned[first])
         best, iae = int(first[np.argmin(iaes)]), float(iaes.min())
         rest = rest[scanned.ki[rest] * iae > 1.0]
         if rest.size:
-            iaes = self._iaes(scanned[rest])
+            iaes = self.iaes(scanned[rest])
             if iaes.min() < iae:
                 best, iae = int(rest[np.argmin(iaes)]), float(iaes.min())
         kp, kd = scanned.kp[best], scanned.kd[best]
@@ -517,7 +486,7 @@ class Search:
         useful[useful] &= c.ki[useful] * iae > 1.0
         iaes = np.full(points.shape[0], math.inf)
         if useful.any():
-            iaes[useful] = self._iaes(c[useful])
+            iaes[useful] = self.iaes(c[useful])
         return iaes
 
     def _at(self, bounds: Bounds, points: FloatArray, iae: float = math.inf) -> Candidates:
@@ -573,20 +542,30 @@ class Search:
         # A slower one turns the loop below the frequencies that are looked at.
         return np.where(found * self.responses.grid[0] <= _TURNED, found, math.inf)
 
-    def _iaes(self, c: Candidates) -> FloatArray:
+    def iaes(self, c: Candidates) -> FloatArray:
         """Return the IAE of a unit step of the load for each controller [y s/u]."""
         h, smoothing = self.rate.period, self.rate.law.smoothing
-        if 2.0 * math.pi / self.frequency > _FAST * h:
-            return load_iaes(self.late, c.kp, c.ki, c.td, c.tf, self.frequency)
-        s, process = self._line
-        back, tf = np.exp(-s * h), c.tf[:, None]
-        p, d, i = c.kp[:, None], c.kd[:, None], c.ki[:, None]
-        law = smoothing.value(tf, h)(back) * (p + i * 0.5 * h * (1.0 + back) / (1.0 - back))
-        if np.any(c.td):
-            law = law + d * smoothing.slope(tf, h)(back)
-        duration = (s.size - 1) * h
-        y = inverted(h * process / ((1.0 - back) * (1.0 + law * process)), duration, sampled=True)
-        return np.asarray(1.0 / c.ki + 2.0 * h * np.maximum(-y, 0.0).sum(axis=1))
+        p, d, i, tf = (values[:, None] for values in (c.kp, c.kd, c.ki, c.tf))
+        if 2.0 * math.pi / self.frequency <= _FAST * h:
+            s, process = self._line
+            back = np.exp(-s * h)
+            law = smoothing.value(tf, h)(back) * (p + i * 0.5 * h * (1.0 + back) / (1.0 - back))
+            if np.any(d):
+                law = law + d * smoothing.slope(tf, h)(back)
+            load = h * process / ((1.0 - back) * (1.0 + law * process))
+            y, step = inverted(load, (s.size - 1) * h, sampled=True), np.array(h)
+        else:
+            reset = c.kp / c.ki
+            if self.late.is_stable:
+                # With a small gain the response is that of the integral alone.
+                reset = reset + 1.0 / (c.ki * abs(self.late.gain))
+            duration = (_RESETS * reset + _TURNS * 2.0 * math.pi / self.frequency)[:, None]
+            s = abscissae(duration, _POINTS)
+            process = self.late.process_sign * self.late(s)
+            law = (p + d * s + i / s) / (1.0 + tf * s + 0.5 * (tf * s) ** 2)
+            y = inverted(process / (s * (1.0 + law * process)), duration)
+            step = duration[:, 0] / _POINTS
+        return np.asarray(1.0 / c.ki + 2.0 * step * np.maximum(-y, 0.0).sum(axis=1))
 
     @cached_property
     def _line(self) -> tuple[ComplexArray, ComplexArray]:
