@@ -85,8 +85,11 @@ _ONE = Rational((1.0,))
 _NOTHING = Rational((0.0,))
 
 
-class _Running:
-    """A rational function of z, run sample by sample from rest."""
+class Running:
+    """A rational function of z, run sample by sample from rest.
+
+    :param function: the function.
+    """
 
     def __init__(self, function: Rational) -> None:
         self._function = function
@@ -94,6 +97,10 @@ class _Running:
         self._outputs = [0.0] * (len(function.bottom) - 1)
 
     def step(self, value: float) -> float:
+        """Return its output for the next input.
+
+        :param value: of the input.
+        """
         self._inputs = [value, *self._inputs[:-1]]
         heard = self._inputs[:: int(self._function.apart)]
         found = sum(b * x for b, x in zip(self._function.top, heard, strict=True))
@@ -489,9 +496,9 @@ class RunningLaw:
         self.period = law.period
         self._gains = law.gains
         self._on_error = law.law.slope is Slope.ERROR
-        self._value = _Running(law.value)
-        self._integral = _Running(law.integral)
-        self._derivative = _Running(law.derivative)
+        self._value = Running(law.value)
+        self._integral = Running(law.integral)
+        self._derivative = Running(law.derivative)
         self._waiting = [0.0] * law.law.delay
         self._setpoint = self._measurement = self._total = self._bias = 0.0
 

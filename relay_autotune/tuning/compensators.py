@@ -27,6 +27,7 @@ from dataclasses import dataclass
 
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import InternalModelLaw
+from relay_autotune.loop.laws import Rational, Running
 from relay_autotune.loop.sampled import Limits, require_period
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
@@ -112,7 +113,7 @@ class SampledCompensator:
         self._gain = compensator.model.gain
         slow = compensator.closed_loop_time
         self._sections = [
-            _Section(tau.real, slow, period) for tau in compensator.model.time_constants
+            _section(tau.real, slow, period) for tau in compensator.model.time_constants
         ]
         self._inside = Plant(compensator.model)
         self._command, self._count = 0.0, 0
@@ -134,22 +135,15 @@ class SampledCompensator:
         return given
 
 
-class _Section:
-    """(tau s + 1)/(lambda s + 1), exact for an input that runs straight between samples."""
-
-    def __init__(self, tau: float, slow: float, period: float) -> None:
-        ratio = period / slow
-        self._decay = math.exp(-ratio)
-        # Weights of the present and the last input in the state, for an input with constant slope.
-        self._present = 1.0 + math.expm1(-ratio) / ratio
-        self._past = 1.0 - self._decay - self._present
-        self._through = tau / slow
-        self._state = self._last = 0.0
-
-    def step(self, value: float) -> float:
-        self._state = self._decay * self._state + self._past * self._last + self._present * value
-        self._last = value
-        return self._through * value + (1.0 - self._through) * self._state
+def _section(tau: float, slow: float, period: float) -> Running:
+    """Return (tau s + 1)/(lambda s + 1), exact for an input that runs straight between samples."""
+    ratio = period / slow
+    # Weights of the present and the last input in the lag's output.
+    decay, present = math.exp(-ratio), 1.0 + math.expm1(-ratio) / ratio
+    past, through = 1.0 - decay - present, tau / slow
+    rest = 1.0 - through
+    top = through + rest * present, rest * past - through * decay
+    return Running(Rational(top, (1.0, -decay)))
 
 
 def dead_time_compensator(task: DesignTask) -> Compensator:
