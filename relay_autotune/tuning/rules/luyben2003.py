@@ -143,23 +143,6 @@ _LONGEST = 1e8
 _TD_GRID = np.geomspace(0.01, 1.0, 18)
 
 
-@dataclass(frozen=True)
-class Derivative:
-    """A series PID controller of the largest gain.
-
-    :param share: its integral time over that of the PI controller.
-    :param series: its gains in the series form.
-    """
-
-    share: float
-    series: SeriesForm
-
-    @property
-    def controller(self) -> Controller:
-        """The same in ISA form."""
-        return self.series.isa()
-
-
 def luyben2003(task: DesignTask) -> tuple[Controller, str]:
     """Return the PI or PID gains of Luyben for an integrating process.
 
@@ -178,22 +161,20 @@ def luyben2003(task: DesignTask) -> tuple[Controller, str]:
     if not wants_pid("luyben2003", task):
         gains = Controller(model.process_sign * gain(model, ti, asked.resonance), ti)
         return gains, f"Luyben 2003: {said}"
-    found = []
+    found = {}
     for share in SHARES:
         try:
-            found.append(derivative(model, share, ti, asked.resonance, 1.0 / asked.filter_ratio))
+            found[share] = derivative(model, share, ti, asked.resonance, 1.0 / asked.filter_ratio)
         except TuningError as error:
             refused = error
     if not found:
         raise refused
-    best = max(found, key=lambda d: abs(d.controller.i))
     tried = ", ".join(
-        f"{100.0 * d.share:.0f} % gives ti {d.series.ti:.4g} s, td {d.series.td:.4g} s, "
-        f"kc {d.series.kc:.4g}"
-        for d in found
+        f"{100.0 * share:.0f} % gives ti {c.ti:.4g} s, td {c.td:.4g} s, kc {c.kc:.4g}"
+        for share, c in found.items()
     )
     reason = f"Luyben 2003: {said}, series PID; of the PI's integral time {tried}"
-    return best.controller, reason
+    return max((c.isa() for c in found.values()), key=lambda c: abs(c.i)), reason
 
 
 def luyben2003_p(task: DesignTask) -> tuple[Controller, str]:
@@ -254,7 +235,7 @@ def gain(model: TransferFunction, ti: float, decibels: float) -> float:
 
 def derivative(
     model: TransferFunction, share: float, ti: float, decibels: float, alpha: float = 0.1
-) -> Derivative:
+) -> SeriesForm:
     """Return the series PID controller of the largest gain (steps 1 to 4 of section 3.4).
 
     :param model: the process.
@@ -282,7 +263,7 @@ def derivative(
             f"has a gain of +{decibels:g} dB"
         )
     td, _ = minimum_near(lambda td: -size(td), tried, top, 1e-6 * short)
-    return Derivative(share, SeriesForm(model.process_sign * size(td), short, td, alpha))
+    return SeriesForm(model.process_sign * size(td), short, td, alpha)
 
 
 def _process(rule: str, task: DesignTask) -> TransferFunction:
