@@ -58,20 +58,22 @@ _MONOTONE = 0.02
 
 
 @dataclass(frozen=True)
-class ReactionCurve:
-    """Gain, lag and delay of a step response.
+class Reduced:
+    """A process of first or second order with a delay, which stands for another.
 
     :param gain: K; of an integrating process the rate per unit step [y/u, y/(u s)].
-    :param lag: T, to 63 % of the way after the delay [s]; inf: it integrates.
-    :param delay: L, where the steepest tangent meets the initial value [s].
+    :param lag: T or tau1 [s]; inf: it integrates.
+    :param delay: L or theta [s].
+    :param second: tau2 [s]; 0: first order.
     """
 
     gain: float
     lag: float
     delay: float
+    second: float = 0.0
 
 
-def step_response(model: TransferFunction) -> ReactionCurve:
+def step_response(model: TransferFunction) -> Reduced:
     """Return K, T and L of a process, from its own exact step response.
 
     :param model: a process with one integrator at most.
@@ -85,9 +87,9 @@ def step_response(model: TransferFunction) -> ReactionCurve:
     if model.integrators:
         # The tangent in the long run begins to rise after all delays and lags.
         shift = sum(t.real for t in model.time_constants) - sum(z.real for z in model.zeros)
-        return ReactionCurve(model.gain, math.inf, model.dead_time + shift)
+        return Reduced(model.gain, math.inf, model.dead_time + shift)
     if is_first_order(model):
-        return ReactionCurve(model.gain, model.time_constants[0].real, model.dead_time)
+        return Reduced(model.gain, model.time_constants[0].real, model.dead_time)
     return _measured(model)
 
 
@@ -137,12 +139,12 @@ class _Rise:
         return float(brentq(missing, self.time[first - 1], self.time[first], rtol=1e-12))
 
 
-def _measured(model: TransferFunction) -> ReactionCurve:
+def _measured(model: TransferFunction) -> Reduced:
     rise = _Rise(model)
     slopes = np.gradient(rise.y, rise.time)
     top = int(np.argmax(slopes))
     delay = float(rise.time[top] - rise.y[top] / slopes[top])
-    return ReactionCurve(model.gain, rise.time_of(_WHOLE) - delay, max(delay, 0.0))
+    return Reduced(model.gain, rise.time_of(_WHOLE) - delay, max(delay, 0.0))
 
 
 def amigo(task: DesignTask) -> tuple[Controller, str]:
@@ -188,22 +190,6 @@ _MOST_ROUNDS = 50
 # A smaller lag this close to the zero is cancelled rather than a larger one.
 _CLOSE = 1.6
 _ROUNDING = 1e-9
-
-
-@dataclass(frozen=True)
-class Reduced:
-    """A process of first or second order with an effective delay.
-
-    :param gain: K; of an integrating process k' [y/u, y/(u s)].
-    :param lag: tau1 [s]; inf: it integrates.
-    :param second: tau2 [s]; 0: first order.
-    :param delay: theta [s].
-    """
-
-    gain: float
-    lag: float
-    second: float
-    delay: float
 
 
 def simc(task: DesignTask) -> tuple[Controller, str]:
@@ -287,7 +273,7 @@ def _reduced(model: TransferFunction, closed: float, order: int) -> Reduced:
         kept[-1] += 0.5 * rest[0]
     if not kept:
         raise TuningError("the half rule leaves no lag beside the zeros: use robust")
-    return Reduced(gain, kept[0], kept[1] if len(kept) > 1 else 0.0, delay)
+    return Reduced(gain, kept[0], delay, *kept[1:])
 
 
 def _cancel(lags: list[float], lead: float, closed: float) -> float:
