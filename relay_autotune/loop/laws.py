@@ -131,20 +131,14 @@ def taps_of(function: Rational, tf: float, period: float) -> FloatArray:
 
 
 class Integral(enum.Enum):
-    """When a law adds a sample's error to its integral; the value is the lead in half periods."""
+    """When a law adds a sample's error to its integral: the lead in half periods, and in words."""
 
-    BEFORE = 1.0
-    TRAPEZOID = 0.0
-    AFTER = -1.0
+    BEFORE = 1.0, "before the output (backward)"
+    TRAPEZOID = 0.0, "before the output (trapezoid)"
+    AFTER = -1.0, "after the output (forward)"
 
-    @property
-    def words(self) -> str:
-        """For people."""
-        return {
-            Integral.BEFORE: "before the output (backward)",
-            Integral.TRAPEZOID: "before the output (trapezoid)",
-            Integral.AFTER: "after the output (forward)",
-        }[self]
+    def __init__(self, lead: float, words: str) -> None:
+        self.lead, self.words = lead, words
 
     def over(self, period: float) -> Rational:
         """Return the integral of a unit signal, ``h (z + 1)/(z - 1)/2 + lead h/2``.
@@ -152,7 +146,7 @@ class Integral(enum.Enum):
         :param period: h [s].
         """
         half = 0.5 * period
-        return Rational((half * (1.0 + self.value), half * (1.0 - self.value)), (1.0, -1.0))
+        return Rational((half * (1.0 + self.lead), half * (1.0 - self.lead)), (1.0, -1.0))
 
 
 class Slope(enum.Enum):

@@ -27,8 +27,11 @@ is stable only if their magnitudes there have a sum below that of the rest (Bell
 from __future__ import annotations
 
 import math
+import operator
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +69,9 @@ def closed_loop_unstable_poles(terms: Sequence[TransferFunction]) -> float:
     later = sum(abs(g) for g, t in zip(limits, terms, strict=True) if t.dead_time > 0.0)
     if not later < abs(1.0 + at_once):
         return math.inf
-    poles = sum(1 for t in _in_common(terms) if t.real < 0.0)
+    # Those that several terms share count once.
+    unstable = [Counter(t for t in term.time_constants if t.real < 0.0) for term in terms]
+    poles = reduce(operator.or_, unstable).total()
     turns = _turning(terms, 1.0 + at_once, later + _SURE * (abs(1.0 + at_once) - later))
     return math.inf if turns is None else poles - round(turns / math.pi)
 
@@ -161,20 +166,6 @@ def at_infinity(term: TransferFunction) -> float:
     if excess > 0:
         return math.inf
     return float((term.gain * np.prod(term.zeros) / np.prod(term.time_constants)).real)
-
-
-def _in_common(terms: Sequence[TransferFunction]) -> list[complex]:
-    """Return the time constants of the least common denominator."""
-    found: list[complex] = []
-    for term in terms:
-        left = list(found)
-        for t in term.time_constants:
-            same = [f for f in left if abs(f - t) <= 1e-12 * abs(t)]
-            if same:
-                left.remove(same[0])
-            else:
-                found.append(t)
-    return found
 
 
 @dataclass(frozen=True)

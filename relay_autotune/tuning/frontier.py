@@ -121,7 +121,7 @@ class Candidates:
         :param rate: the law, of which kp and td hold what its integral adds in half a sample.
         """
         ki, kd = float(self.ki[k]), float(self.kd[k])
-        kp = float(self.kp[k]) - rate.law.integral.value * 0.5 * rate.period * ki
+        kp = float(self.kp[k]) - rate.law.integral.lead * 0.5 * rate.period * ki
         tf = rate.law.smoothing.setting(float(self.tf[k]), rate.period)
         return Controller(sign * kp, kp / ki, kd / kp, tf)
 

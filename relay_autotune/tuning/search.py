@@ -220,7 +220,7 @@ class Search:
     def _ceiling(self, kp: FloatArray) -> FloatArray | float:
         """Return the integral gains that each proportional gain allows by itself, shape (k,)."""
         # An integral that is advanced before the output takes a part of kp'; the rest is kp.
-        lead = self.rate.law.integral.value * self.rate.period
+        lead = self.rate.law.integral.lead * self.rate.period
         return _SHARE * 2.0 * kp / lead if lead > 0.0 else math.inf
 
     def _span(self, td: float) -> tuple[float, float] | None:
