@@ -200,11 +200,13 @@ CLEAR_OF_STEPS = 5.0
 # only just clear, the verdict varies with the noise.
 _AMPLE, _OF_ROOM = 20.0, 1.0 / 3.0
 
-# Least and largest growth of a too small amplitude at a time.
-_LEAST_GROWTH = 1.5
+# Largest growth of a too small amplitude at a time.
 _MOST_GROWTH = 4.0
 # Reserve on a target, since the swing is not exactly proportional to the amplitude.
 _TO_SPARE = 1.2
+# The first swing at an amplitude is 10 to 25 % smaller than the settled one: from this part of a
+# target on, another cycle shows whether that is reached.
+_MAY_REACH = 0.75
 
 # First share of a given amplitude, since its levels may lie beyond the actuator's ends.
 _SMALL = 0.25
@@ -243,6 +245,8 @@ class Levels:
             self.begin_small()
         elif parameters.finds_amplitude:
             self._wanted = parameters.first_amplitude
+        # The amplitude of the last swing.
+        self._seen_at = 0.0
         # Amplitude, half swing and levels of the first cycle that was clear of the noise.
         self._first_clear: tuple[float, float, float, float] | None = None
         self._set()
@@ -356,20 +360,24 @@ class Levels:
             high=high,
         )
 
-    def growth_for(self, half_swing: float, least: float) -> float:
-        """Return the factor by which the amplitude must grow, 1 if it is large enough.
+    def growth_for(self, half_swing: float, least: float) -> float | None:
+        """Return the factor by which the amplitude must grow, None if it is large enough.
+
+        It is 1 where the swing may reach the least one at the present amplitude.
 
         :param half_swing: half the swing of the measurement over the last cycle [y].
         :param least: the half swing that is large enough [y].
         """
         if not self.can_grow:
-            return 1.0
+            return None
         if self.from_small:
             return self._parameters.amplitude / self._wanted
+        is_first, self._seen_at = self.amplitude != self._seen_at, self.amplitude
         if half_swing >= least:
+            return None
+        if is_first and half_swing >= _MAY_REACH * least:
             return 1.0
-        ratio = _TO_SPARE * least / half_swing if half_swing > 0.0 else math.inf
-        return min(max(ratio, _LEAST_GROWTH), _MOST_GROWTH)
+        return min(_TO_SPARE * least / half_swing, _MOST_GROWTH) if half_swing else _MOST_GROWTH
 
 
 # The share of the high level in a period is known when two cycles agree within the first number; a

@@ -492,7 +492,7 @@ class Switching:
             return False, why
         levels.note_small(half_swing, clear)
         factor = levels.growth_for(half_swing, least)
-        if factor != 1.0:
+        if factor is not None:
             levels.grow(factor)
             self.cycle_start = self.cycle_start[-1:]
             return True, None

@@ -79,6 +79,21 @@ def test_a_target_in_units_of_the_measurement_is_met():
     assert 1.5 <= 0.5 * (cycle.peak_max - cycle.peak_min) < 3.0
 
 
+def test_a_first_swing_that_is_just_short_of_the_target_is_given_another_cycle():
+    """It is smaller than those after it: the amplitude grew by half where it was large enough."""
+    lags = TransferFunction(1.0, (), (10.0, 10.0), dead_time=1.0)
+
+    def half_swings(target):
+        tune = searching(target_amplitude=target)
+        run(tune, Plant(lags), 0.05)
+        return tune.settings.amplitude, [0.5 * (c.peak_max - c.peak_min) for c in tune.cycles]
+
+    amplitude, (first, *_, settled) = half_swings(0.02)
+    assert 1.05 * first < settled
+    grown, (least, *_) = half_swings(1.05 * first)
+    assert grown == amplitude and least >= 1.05 * first
+
+
 def test_a_target_out_of_reach_is_said_and_the_limits_hold():
     tune = experiment(amplitude=0.0, target_amplitude=50.0, command_min=-1.0, command_max=3.0)
     run(tune, FopdtPlant(2.0, 2.0, 1.0), 0.05)
