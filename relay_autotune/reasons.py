@@ -369,8 +369,8 @@ class Code(enum.IntEnum):
         142,
         "the actuator is clipped: the amplitude grew from {before:.3g} to {now:.3g}, and half the "
         "swing of the measurement from {swing_before:.3g} to {swing:.3g} only",
-        "give its true ends for command_min and command_max, or an amplitude with which it stays "
-        "between {low:.3g} and {high:.3g}",
+        "give the levels limits that it reaches, or an amplitude with which they stay between "
+        "{low:.3g} and {high:.3g}",
     )
     """The actuator does not go as far as it is commanded."""
     REACH_UNKNOWN = _Row(

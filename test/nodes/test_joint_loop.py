@@ -19,6 +19,7 @@ from toolbox_pid import ToolboxPid
 from relay_autotune.cli import joint_tune
 from relay_autotune.cli.joint_tune import JointLoop
 from relay_autotune.errors import LoopError
+from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.loop import laws
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes import ros2_control
@@ -38,6 +39,7 @@ from relay_autotune.nodes.ros2_control import (
     limits_in,
     put_gains,
 )
+from relay_autotune.reasons import Code
 from relay_autotune_msgs.action import Tune
 
 STRATEGIES = ("back_calculation", "conditional_integration", "none", "legacy")
@@ -513,3 +515,11 @@ def test_a_controller_that_was_deactivated_is_told_as_such() -> None:
     look = manager.still_active("pid")
     assert look() == ""
     assert look() == "pid is not loaded: it was deactivated, and the log of /cm says when"
+
+
+def test_clipping_names_no_parameter_that_the_user_of_a_joint_never_gave() -> None:
+    """The levels are references there, and their limits are --within."""
+    values = dict.fromkeys(("before", "now", "swing_before", "swing", "low", "high"), 1.0)
+    remedy = next(check.remedy for check in CHECKS if check.name == "clipped")
+    for told in (str(Code.CLIPPED(**values)), remedy):
+        assert "limits" in told and "command_m" not in told

@@ -260,7 +260,7 @@ MODEL_CHECKS = (
         sentence="commands on one side of {detail} lose {value} of the effect that those on the "
         "other side have",
         remedy="keep the command where the actuator is not at its end, and give its ends as "
-        "command_min and command_max",
+        "limits of the command",
         measure=_clipped,
     ),
 )
