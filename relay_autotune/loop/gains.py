@@ -20,7 +20,7 @@ from __future__ import annotations
 import cmath
 import math
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -57,6 +57,8 @@ class Controller:
     """Time constant of the filter; 0: none."""
     b: float = result_field("", 1.0, column=1)
     """Set-point weight."""
+    period: ClassVar[float] = 0.0
+    """Sampling period: that of a continuous controller [s]."""
 
     def __post_init__(self) -> None:
         numbers = (self.kc, self.ti, self.td, self.tf, self.b)
@@ -87,11 +89,6 @@ class Controller:
     def d(self) -> float:
         """Derivative gain of the parallel form, kc td [u s/y]."""
         return self.kc * self.td
-
-    @property
-    def period(self) -> float:
-        """Sampling period: 0, that of a continuous controller [s]."""
-        return 0.0
 
     @property
     def times(self) -> tuple[float, ...]:
@@ -285,11 +282,8 @@ class InternalModelLaw:
 
     forward: TransferFunction
     inside: TransferFunction
-
-    @property
-    def period(self) -> float:
-        """Sampling period: 0, that of a continuous controller [s]."""
-        return 0.0
+    period: ClassVar[float] = 0.0
+    """Sampling period: that of a continuous controller [s]."""
 
     @property
     def i(self) -> float:
