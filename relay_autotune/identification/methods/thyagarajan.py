@@ -119,8 +119,8 @@ def _flat(s: Shape, level: float | None) -> Sequence[float]:
     return flat_fopdt(s.period, s.amplitude, s.rise, s.rise_half, 1.0, level)
 
 
-_SHARP, _UNSTABLE = _by_peak(FOPDT), _by_peak(UNSTABLE_FOPDT)
-_FLAT = Row("by the first harmonic, eqs 20 to 22", FOPDT, _flat, "FOPDT")
+SHARP_FOPDT, _UNSTABLE_FOPDT = _by_peak(FOPDT), _by_peak(UNSTABLE_FOPDT)
+FLAT_FOPDT = Row("by the first harmonic, eqs 20 to 22", FOPDT, _flat, "FOPDT")
 _INTEGRATING = Row(
     "for an ideal relay, the limit of eqs 10 and 11",
     IPDT,
@@ -212,21 +212,21 @@ def _chosen(shape: Shape, reading: Reading, known: Known, categorised: str = "")
         known = replace(known, order=order)
     structure = structure_asked_for(METHOD, known, _STRUCTURES)
     if structure == UNSTABLE_FOPDT:
-        return replace(_UNSTABLE, text="")
+        return replace(_UNSTABLE_FOPDT, text="")
     if structure == FOPDT:
-        return replace(_FLAT if category == "1b" else _SHARP, text="")
+        return replace(FLAT_FOPDT if category == "1b" else SHARP_FOPDT, text="")
     if structure is not None:
         return replace(_lags(structure.order, dead_time), text="")
     if category in ("2", "3"):
         return _lags(order, dead_time)
     if category == "1b":
-        return _FLAT
+        return FLAT_FOPDT
     peak = shape.time_to_peak if math.isnan(dead_time) else dead_time
     earliest = 0.5 * shape.half_period * (1.0 - shape.level / shape.amplitude)
     unsure = max(_DEVIATIONS * float(np.nan_to_num(reading.std[_PEAK])), 1e-9 * earliest)
     if abs(peak - earliest) <= unsure and math.isnan(dead_time):
         return _INTEGRATING
-    return _SHARP if peak > earliest else _UNSTABLE
+    return SHARP_FOPDT if peak > earliest else _UNSTABLE_FOPDT
 
 
 def _identified(

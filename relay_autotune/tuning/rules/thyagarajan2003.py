@@ -20,8 +20,12 @@ from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.limit_cycle.shape import Shape, shape_of_half_cycle
 from relay_autotune.identification.methods.lags import equal
-from relay_autotune.identification.methods.thyagarajan import HIGHER_ORDER, dead_time_ratio
-from relay_autotune.identification.methods.wang import flat_fopdt, fopdt
+from relay_autotune.identification.methods.thyagarajan import (
+    FLAT_FOPDT,
+    HIGHER_ORDER,
+    SHARP_FOPDT,
+    dead_time_ratio,
+)
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.rules.formulas import (
@@ -177,14 +181,10 @@ def _equivalent(
     category: str, shape: Shape, model: TransferFunction
 ) -> tuple[TransferFunction | None, Callable[[DesignTask], _Designed]]:
     """Return a model of the category, None where the task has one, and the category's rule."""
-    period, amplitude = shape.period, shape.amplitude
     if category in ("1a", "1b"):
-        if category == "1a":
-            values = fopdt(period, amplitude, shape.time_to_peak, 1.0)
-        else:
-            values = flat_fopdt(period, amplitude, shape.rise, shape.rise_half, 1.0, 0.0)
-        return TransferFunction.fopdt(*values), _table_4
-    lags, cycle = _real_lags(model), SymmetricCycle(period, amplitude, 1.0, 0.0, 0.0)
+        row = SHARP_FOPDT if category == "1a" else FLAT_FOPDT
+        return row.structure.build(tuple(row.solve(shape, 0.0))), _table_4
+    lags, cycle = _real_lags(model), SymmetricCycle(shape.period, shape.amplitude, 1.0, 0.0, 0.0)
     if category == "2":
         if len(lags) == 2:
             return None, phase_margin
