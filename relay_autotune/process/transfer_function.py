@@ -569,12 +569,7 @@ def process_latex(model: TransferFunction) -> str:
 
     :param model: the process.
     """
-    above = _factors(model.zeros, model, _latex_factor)
-    below = _factors(model.time_constants, model, _latex_factor)
-    if model.integrators > 0:
-        below.insert(0, "s" if model.integrators == 1 else f"s^{{{model.integrators}}}")
-    if model.integrators < 0:
-        above.insert(0, "s" if model.integrators == -1 else f"s^{{{-model.integrators}}}")
+    above, below = _sides(model, _latex_factor, _latex_power("s", abs(model.integrators)))
     top = _SPACE.join([_latex_number(model.gain), *above])
     text = rf"\frac{{{top}}}{{{_SPACE.join(below)}}}" if below else top
     if model.dead_time:
@@ -587,11 +582,8 @@ def process_mathml(model: TransferFunction) -> str:
 
     :param model: the process.
     """
-    above = _factors(model.zeros, model, _mathml_factor)
-    below = _factors(model.time_constants, model, _mathml_factor)
-    if model.integrators:
-        power = _mathml_power("<mi>s</mi>", abs(model.integrators))
-        (below if model.integrators > 0 else above).insert(0, power)
+    power = _mathml_power("<mi>s</mi>", abs(model.integrators))
+    above, below = _sides(model, _mathml_factor, power)
     top = "".join([_mathml_number(model.gain), *above])
     if model.dead_time:
         exponent = f"<mo>{_MINUS}</mo>{_mathml_number(model.dead_time)}<mi>s</mi>"
@@ -629,14 +621,25 @@ def _plain(polynomial: _Polynomial) -> str:
     return f"(1 + {digits(polynomial[1])} s + {digits(polynomial[2])} s^2)"
 
 
-def _factors(
-    constants: Iterable[complex],
-    model: TransferFunction,
-    draw: Callable[[_Polynomial, int], str],
-) -> list[str]:
-    """Return the factors, equal ones as a power."""
-    counted = Counter(_polynomials(constants, model))
-    return [draw(polynomial, power) for polynomial, power in counted.items()]
+def _sides(
+    model: TransferFunction, draw: Callable[[_Polynomial, int], str], integrators: str
+) -> tuple[list[str], list[str]]:
+    """Return the factors above and below the line, equal ones as a power.
+
+    :param draw: from a polynomial and its power to text.
+    :param integrators: their power of s.
+    """
+    above, below = (
+        [draw(*each) for each in Counter(_polynomials(constants, model)).items()]
+        for constants in (model.zeros, model.time_constants)
+    )
+    if model.integrators:
+        (below if model.integrators > 0 else above).insert(0, integrators)
+    return above, below
+
+
+def _latex_power(inner: str, power: int) -> str:
+    return f"{inner}^{{{power}}}" if power > 1 else inner
 
 
 def _latex_number(value: float) -> str:
@@ -648,7 +651,7 @@ def _latex_factor(polynomial: _Polynomial, power: int) -> str:
     text = "1"
     for k, c in enumerate(polynomial[1:], start=1):
         text += f" {'-' if c < 0.0 else '+'} {_latex_number(abs(c))} s" + ("^2" if k == 2 else "")
-    return f"({text})" + (f"^{{{power}}}" if power > 1 else "")
+    return _latex_power(f"({text})", power)
 
 
 def _mathml_number(value: float) -> str:
