@@ -55,11 +55,15 @@ class Times:
     :param numbers: as they stand.
     :param dates: nanoseconds since 1970.
     :param clock: times of day [ns].
+    :param either: places of dates that could have the day or the month first, with their texts.
+    :param day_first: what the others say.
     """
 
     numbers: list[float] = field(default_factory=list)
     dates: list[int] = field(default_factory=list)
     clock: list[int] = field(default_factory=list)
+    either: list[tuple[int, str]] = field(default_factory=list)
+    day_first: set[bool] = field(default_factory=set)
 
 
 class TextTable:
@@ -240,6 +244,7 @@ class TextTable:
             lines.append(line)
         if damaged and len(damaged) > _DAMAGED * len(lines):
             raise damaged[0]
+        self._settle_order(times)
         if len(lines) < 2:
             raise BagError(f"{self._path} has {len(lines)} rows of numbers; expected at least two")
         for count, what in ((len(times.dates), "dates"), (len(times.clock), "times of day")):
@@ -288,19 +293,32 @@ class TextTable:
         date = None if _is_number(cell) else _date(cell)
         if date is None:
             times.numbers.append(self._number(line, at, cell)[0])
-        else:
-            if not times.dates and date[1]:
-                self._tell_order(cell)
-            (times.dates if date[1] else times.clock).append(date[0])
+            return
+        (times.dates if date[1] else times.clock).append(date[0])
+        # A year of four digits leaves no choice.
+        if "/" in cell[:3]:
+            first, second = map(int, cell.split("/")[:2])
+            if max(first, second) > 12:
+                times.day_first.add(first > 12)
+            elif first != second:
+                times.either.append((len(times.dates) - 1, cell))
 
-    def _tell_order(self, cell: str) -> None:
-        """Say how a date is read that could be read in two ways."""
-        found = _DATE.fullmatch(cell)
-        first, mark, second = found.groups()[:3] if found else ("", "", "")
-        if mark == "/" and first != second and max(int(first), int(second)) <= 12:
+    def _settle_order(self, times: Times) -> None:
+        """Read dates that could be read in two ways as the others of their column are."""
+        if len(times.day_first) > 1:
+            raise BagError(
+                f"{self._path} has dates with the day first and others with the month first; "
+                "expected one of them"
+            )
+        if times.day_first == {True}:
+            for place, cell in times.either:
+                times.dates[place] = _date(cell, day_first=True)[0]  # type: ignore[index]
+        elif times.either and not times.day_first:
+            cell = times.either[0][1]
+            month, day = map(int, cell.split("/")[:2])
             self.notes.append(
-                f"{cell!r} is taken with the month first, as in 12/31/2026: month {int(first)}, "
-                f"day {int(second)}"
+                f"{cell!r} is taken with the month first, as in 12/31/2026: month {month}, "
+                f"day {day}"
             )
 
     def _number(self, line: int, at: int, cell: str) -> tuple[float, str]:
@@ -390,12 +408,12 @@ def _are_units(row: Sequence[str]) -> bool:
     return len(cells) >= 2 and not any(re.search(r"\d", cell) for cell in cells)
 
 
-def _date(cell: str) -> tuple[int, bool] | None:
+def _date(cell: str, *, day_first: bool = False) -> tuple[int, bool] | None:
     """Return a date in nanoseconds since 1970, UTC where it names no zone, or a time of day.
 
     The second value tells whether it is a date. Of three numbers one of four digits is the year,
-    and 1/2 is the second of January unless a number above 12 says otherwise; 1.2 the first of
-    February.
+    and 1/2 is the second of January unless ``day_first``, or a number above 12, says otherwise;
+    1.2 the first of February.
     """
     match = _DATE.fullmatch(cell)
     if match is None:
@@ -411,7 +429,7 @@ def _date(cell: str) -> tuple[int, bool] | None:
         year, month, day = first, middle, last
     else:
         year = last + 2000 * (last < 100)
-        day_first = mark != "/" or first > 12
+        day_first = day_first or mark != "/" or first > 12
         day, month = (first, middle) if day_first else (middle, first)
     away = timedelta()
     if zone and zone != "Z":

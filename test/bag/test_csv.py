@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime, timedelta
+
 import numpy as np
 import pytest
 
@@ -64,6 +66,21 @@ def test_a_date_that_could_be_two_is_told(tmp_path, day, told):
     (log,) = read_csv(write(tmp_path / "a.csv", f"time,y,u\n{rows}"), Selection())
     said = [note for note in log.notes if "with the month first" in note]
     assert [note.endswith(": month 4, day 5") for note in said] == [True] * told
+
+
+def test_a_column_of_dates_is_read_in_one_order_which_any_of_them_may_tell(tmp_path):
+    # From the 12th of September, which could be the 9th of December, into the 13th.
+    start = datetime(2026, 9, 12, 23, 59, 50, tzinfo=UTC)
+    times = [start + timedelta(seconds=2 * k) for k in range(12)]
+    rows = [f"{t:%d/%m/%Y %H:%M:%S},{k % 5},{k // 3 % 2}" for k, t in enumerate(times)]
+    path = write(tmp_path / "a.csv", "\n".join(["time,y,u", *rows, ""]))
+    (log,) = read_csv(path, Selection())
+    assert log.measurement.time_ns.tolist() == [round(1e9 * t.timestamp()) for t in times]
+    assert not any("with the month first" in note for note in log.notes)
+    other = rows[-1].replace("13/09", "09/13")
+    mixed = write(tmp_path / "b.csv", "\n".join(["time,y,u", *rows[:-1], other, ""]))
+    with pytest.raises(BagError, match="day first and others with the month first"):
+        read_csv(mixed, Selection())
 
 
 def test_dates_in_seconds_become_the_start(tmp_path):
