@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse
@@ -18,7 +18,7 @@ from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.phases import State
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
-from relay_autotune.reasons import Reason
+from relay_autotune.reasons import Code, Reason
 from relay_autotune.text import TOLD_EVERY
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import TransferFunction
@@ -152,6 +152,7 @@ class TuneAction(OneGoal):
     """Serve the action.
 
     :param node: the node.
+    :param ready: returns once a tune may be asked for.
     :param start: takes an amplitude [u] and whether it is a dry run; starts or checks a tune, and
         says what became of it.
     :param cancel: called when a client cancels the running tune.
@@ -160,13 +161,14 @@ class TuneAction(OneGoal):
     def __init__(
         self,
         node: ServedNode,
+        ready: Callable[[], Awaitable[None]],
         start: Callable[[float, bool], StartTune.Response],
         cancel: Callable[[], None],
     ) -> None:
         super().__init__(
             node, Tune, "~/tune", self._accept, cancel, status_pub_qos_profile=quality.STATUS
         )
-        self._start = start
+        self._ready, self._start = ready, start
         self._forget("")
 
     def _forget(self, experiment_id: str) -> None:
@@ -178,8 +180,15 @@ class TuneAction(OneGoal):
         self._model: Any = None
 
     def _accept(self, goal: Any) -> None:
+        self._node.executor.create_task(self._begin, goal)
+
+    async def _begin(self, goal: Any) -> None:
         request = goal.request
-        started = self._start(request.amplitude, request.dry_run)
+        await self._ready()
+        if goal.is_cancel_requested:
+            started = refused(Code.CANCELLED())
+        else:
+            started = self._start(request.amplitude, request.dry_run)
         if started.experiment_id:
             self.running = goal
             self._forget(started.experiment_id)

@@ -31,9 +31,6 @@ from relay_autotune.nodes.live_types import CommandMessage, reader_of
 
 # How long present commands are listened to [s].
 _LISTEN = 1.0
-# A node that was there before may be unknown until it next announces itself [s]: Fast DDS does so
-# every 3 s, and its publishers are told within some 0.1 s.
-_ALL_KNOWN_AFTER = 3.5
 # How long a node may take to answer [s], and after which time one may be asked again.
 ANSWER_WITHIN, _ASK_AGAIN = 10.0, 3.0
 # Messages of a latched topic from before the subscription that are taken.
@@ -404,7 +401,7 @@ class LoopClient:
             ends = self._node.get_publishers_info_by_topic(name)
             return sorted({quality.who(end) for end in ends} - own)
 
-        self.rest(self._joined + _ALL_KNOWN_AFTER - time.monotonic())
+        self.rest(self._joined + quality.ALL_KNOWN_AFTER - time.monotonic())
         # A publisher is told before the name of its node.
         self.wait(lambda: quality.UNNAMED not in found(), _LISTEN)
         return " and ".join(found())

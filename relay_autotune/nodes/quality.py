@@ -60,6 +60,10 @@ STATUS = QoSProfile(
 )
 """Profile of the status that shows whether a tune runs, and whether relay_node lives."""
 
+# A node that was there before may be unknown until it next announces itself [s]: Fast DDS does so
+# every 3 s, and its publishers are told within some 0.1 s.
+ALL_KNOWN_AFTER = 3.5
+
 
 def publisher(
     node: Node, kind: Any, topic: str, profile: QoSProfile, *, overridable: bool = False

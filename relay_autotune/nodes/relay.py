@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from std_srvs.srv import Trigger
 
@@ -30,7 +31,7 @@ from relay_autotune.nodes.readiness import Checklist, Readiness, Ready, answer_o
 from relay_autotune.nodes.results import MODEL, OwnResults, said_by
 from relay_autotune.nodes.session import Recordings, Session, SetpointSession, reported_by
 from relay_autotune.nodes.tables import FIXED_PARAMETERS, TUNE_PARAMETERS
-from relay_autotune.nodes.watch import Sensor
+from relay_autotune.nodes.watch import Arrival, Sensor
 from relay_autotune.reasons import Code, Reason, reason_of
 from relay_autotune.record.record import Cycle, Outcome
 from relay_autotune.text import duration
@@ -86,9 +87,12 @@ class RelayNode(ServedNode):
         self._topic = self._ends.measurement.topic_name
         self._recordings = Recordings(self, self._ends.recorded)
         self._results = OwnResults(self)
-        self.create_service(StartTune, "~/start_tune", self._on_start)
+        self._arrival = Arrival(self)
+        # The others of the loop go on while it waits.
+        waiting = ReentrantCallbackGroup()
+        self.create_service(StartTune, "~/start_tune", self._on_start, callback_group=waiting)
         serve(self, Trigger, "~/abort", self._abort)
-        self._action = TuneAction(self, self._request, self._cancel)
+        self._action = TuneAction(self, self._arrival.is_over, self._request, self._cancel)
         self._awaits_results: Session | None = None
         self._narrator = Narrator(self, self._words, self._tell)
         self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
@@ -172,7 +176,10 @@ class RelayNode(ServedNode):
 
     # Starting.
 
-    def _on_start(self, request: StartTune.Request, _: StartTune.Response) -> StartTune.Response:
+    async def _on_start(
+        self, request: StartTune.Request, _: StartTune.Response
+    ) -> StartTune.Response:
+        await self._arrival.is_over()
         return self._request(request.amplitude, request.dry_run)
 
     def _request(self, amplitude: float, dry_run: bool) -> StartTune.Response:

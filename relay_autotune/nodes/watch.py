@@ -19,6 +19,7 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
+from rclpy.task import Future
 from rclpy.timer import Timer
 
 from relay_autotune.errors import FieldError, ParameterError
@@ -497,6 +498,25 @@ class Guard:
             if reason := check():
                 self._stop(reason)
                 return
+
+
+class Arrival:
+    """Wait until a node that has just started must know all others of its graph.
+
+    :param node: the node.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._known: Future = Future()
+        self._timer = node.create_timer(quality.ALL_KNOWN_AFTER, self._end, clock=STEADY)
+
+    def _end(self) -> None:
+        self._timer.cancel()
+        self._known.set_result(None)
+
+    async def is_over(self) -> None:
+        """Return once it must."""
+        await self._known
 
 
 def second_publisher(node: Node, topic: str) -> Reason | None:

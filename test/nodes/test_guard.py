@@ -12,7 +12,9 @@ from types import SimpleNamespace
 import pytest
 
 from relay_autotune.nodes import watch
+from relay_autotune.nodes.relay import RelayNode
 from relay_autotune.nodes.watch import (
+    Arrival,
     FollowWatch,
     LastSamples,
     Overtime,
@@ -214,3 +216,23 @@ def test_rest_is_told_of_any_sensor_in_the_end(every, count, span):
     """A fast one has no samples of 2 s among those that are kept, a slow one few in 10 s."""
     rest = samples_of(every, count).rest()
     assert rest is not None and rest.span == pytest.approx(span, rel=0.01)
+
+
+def test_a_tune_is_asked_for_once_every_other_publisher_must_be_known() -> None:
+    """Asked within 3 s of its start, a relay_node overlooked another publisher of its command."""
+    timers: list[tuple[float, Callable[[], None]]] = []
+    timer = SimpleNamespace(cancel=lambda: None)
+    node = SimpleNamespace(
+        create_timer=lambda wait, work, clock: timers.append((wait, work)) or timer
+    )
+    relay = SimpleNamespace(_arrival=Arrival(node), _request=lambda *asked: asked)
+    request = SimpleNamespace(amplitude=0.5, dry_run=False)
+    answer = RelayNode._on_start(relay, request, None)
+    answer.send(None)
+    ((wait, work),) = timers
+    # Fast DDS announces a node every 3 s.
+    assert wait > 3.0
+    work()
+    with pytest.raises(StopIteration) as done:
+        answer.send(None)
+    assert done.value.value == (0.5, False)
