@@ -155,9 +155,14 @@ def _before_stop(problem: Problem, chosen: Callable[[Problem], Fit]) -> tuple[Pr
     band = max(_STILL_NOISE * roughness(problem.y), _STILL)
     for begin, stop, away in at_its_ends(smooth(problem.y), band):
         before = problem.part(slice(0, begin))
-        if begin < _LEAST_SAMPLES or not changes_within(u, before.time).size:
+        held = problem.time[begin : (begin + stop) // 2]
+        if not changes_within(u, before.time).size or changes_within(u, held).size:
+            # A controller, or a further command, may have made it stay.
             continue
-        fit = chosen(before.thinned(_FEW))
+        try:
+            fit = chosen(before.thinned(_FEW))
+        except IdentificationError:
+            continue
         model = fit.problem.structure.model_at(fit.state.theta, fit.state.coefficients)
         if model is None or model.grows:
             continue
