@@ -215,6 +215,8 @@ class Identification:
     effects: tuple[float, float] = (1.0, 1.0)
     # True: the process was not at rest at the relay's baseline when the test began.
     began_away: bool = False
+    # True: a step of the load was estimated with the model.
+    loaded: bool = False
     # Dry friction that was estimated with the model, as a command [u]; 0: none.
     friction: float = 0.0
     # Standard deviation of the measurement beside drift, past and load, which the model has to

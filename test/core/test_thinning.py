@@ -174,13 +174,3 @@ def test_what_a_first_order_leaves_of_means_is_not_taken_for_jitter():
     found = identify(short, "waveform")
     assert found.structure == "sopdt"
     assert found.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.02)
-
-
-def test_what_is_left_out_of_samples_that_share_their_times_is_a_share_of_the_samples():
-    """The median time between them is 0 there."""
-    rng = np.random.default_rng(8)
-    t = np.repeat(np.arange(1200) * 0.1, 10)
-    record = made(TransferFunction.fopdt(2.0, 0.05, 0.02), t, levels(t, 0.2, rng), rng)
-    found = analyse(record, alone=True)
-    (left,) = (f for f in found.judgement.findings if f.name == "left_out")
-    assert 0.0 <= left.value < 1.0

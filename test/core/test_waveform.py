@@ -411,3 +411,17 @@ def test_a_jump_in_the_last_samples_is_left_out():
     assert found.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.03)
     assert found.fit.residual_rms < 0.03
     assert any("the last" in w and "were left out" in w for w in found.warnings)
+
+
+def test_an_ultimate_point_beyond_the_rate_of_the_samples_is_not_determined():
+    time = np.arange(0.0, 20.0, 0.1)
+    u = PiecewiseConstant(np.array([2.0, 9.0]), np.array([1.0, 0.0]), 0.0)
+    rng = np.random.default_rng(5)
+    model = TransferFunction.fopdt(1.0, 2.0, 0.01)
+    y = response(model, time, u) + rng.normal(0.0, 0.003, time.size)
+    found = identify_waveform(Record(time=time, measurement=y, command=u(time), held_input=u))
+    assert found.ultimate_frequency > math.pi / 0.1
+    assert math.isnan(found.ultimate_gain_std)
+    assert math.isnan(found.ultimate_frequency_std)
+    assert any("beyond half the rate" in warning for warning in found.warnings)
+    assert "ultimate_gain" not in [c.name for c in found.combinations]

@@ -67,7 +67,9 @@ def without_disturbance(
         alone = identify(end)
     except RelayAutotuneError:
         return found
-    if not _unexplained(alone, record) < _BETTER * _unexplained(found, record):
+    better = _unexplained(alone, record) < _BETTER * _unexplained(found, record)
+    if alone.loaded or not better:
+        # An end that needs another load is no end after the load.
         return found
     left_out = len(record) - len(end)
     fitted = alone.fitted

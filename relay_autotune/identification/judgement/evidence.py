@@ -305,6 +305,16 @@ class Evidence:
         lowest, highest = 0.5 / self.record.duration, 4.0 / self.record.mean_interval
         return math.pi * np.geomspace(lowest, highest, _FREQUENCIES)
 
+    @property
+    def shown(self) -> float:
+        """Time for which the fitted samples show answers to the command [s]."""
+        time, fitted = self.record.time, self.found.fitted
+        if len(fitted) == len(time) and np.isfinite(fitted).any():
+            time = time[np.isfinite(fitted)]
+        changes = self.record.input().times
+        begin = np.min(changes[changes >= self.record.time[0]], initial=time[-1])
+        return float(time[-1] - max(begin, time[0]))
+
     def growth(self, model: TransferFunction) -> float:
         """Return the longest time of a constant command in time constants of a model's growth.
 

@@ -109,6 +109,15 @@ def _pace(evidence: Evidence) -> Measured | None:
     return Measured(lasting / alone) if alone > 0.0 else None
 
 
+def _beyond(evidence: Evidence) -> Measured | None:
+    loop, shown = evidence.loop, evidence.shown
+    if loop is None or not shown > 0.0:
+        return None
+    s = np.array([1j / shown])
+    gain = float(abs(evidence.found.model(s) * loop.controller(s))[0])
+    return Measured(1.0 / gain) if gain > 0.0 else None
+
+
 def _halves(evidence: Evidence) -> Measured | None:
     loop, halves = evidence.loop, evidence.found.halves
     if loop is None or not halves:
@@ -144,15 +153,6 @@ def _direction(evidence: Evidence) -> Measured | None:
         if draws
     ]
     return Measured(*max(shares)) if shares else None
-
-
-def _left_out(evidence: Evidence) -> Measured | None:
-    fitted, record, used = evidence.found.fitted, evidence.record, 1.0
-    if record.unthinned is not None:
-        # Of a long record with fast responses only a part is looked at.
-        used = record.unthinned.used / record.unthinned.samples
-    share = float(np.isnan(fitted).mean()) if len(fitted) else 0.0
-    return Measured(1.0 - used * (1.0 - share))
 
 
 def _clipped(evidence: Evidence) -> Measured | None:
@@ -227,18 +227,6 @@ MODEL_CHECKS = (
         measure=_share,
     ),
     Check(
-        name="left_out",
-        title="Left out",
-        what="share of the record that the model was not fitted to, since no model fits it "
-        "together with the rest, or only a part of a long record was looked at",
-        unit="",
-        doubtful=0.5,
-        sentence="{value} of the record is left out: the model rests on the others",
-        remedy="repeat the test while nothing else acts on the process, on a computer with time "
-        "for it",
-        measure=_left_out,
-    ),
-    Check(
         name="limit_cycle",
         title="Limit cycle",
         what="period of the limit cycle that the same relay makes with the model, relative to the "
@@ -291,6 +279,18 @@ LOOP_CHECKS = (
         "the loop is unstable or nearly so",
         remedy="see whether load, operating point or other inputs changed, and record again",
         measure=_halves,
+    ),
+    Check(
+        name="beyond",
+        title="Beyond",
+        what="1 over the loop's gain at the frequency of which the record shows one radian, from "
+        "the first change of the command to the last sample that was fitted",
+        unit="",
+        doubtful=1.0,
+        sentence="at the lowest frequency that the record shows the loop's gain is 1/{value}: how "
+        "slowly it settles was not seen",
+        remedy="record for longer after the first change of the command",
+        measure=_beyond,
     ),
     Check(
         name="pace",

@@ -101,6 +101,14 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     )
     # One of each opposite pair: the other one has the same square.
     gain_std, frequency_std = point_stds(found, allowed.mixture[::2])
+    if found.ultimate_frequency * min(r.interval for r in records) > math.pi:
+        # Samples show nothing of what is faster than half their rate.
+        gain_std = frequency_std = math.nan
+        told = (
+            f"the model's ultimate frequency of {found.ultimate_frequency:.3g} rad/s is beyond "
+            "half the rate of the samples: the record does not show K_u and w_u"
+        )
+        found = replace(found, warnings=(*found.warnings, told))
     found = _with_rivals(found, fit, shares)
     found = replace(
         found,
@@ -110,6 +118,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         halves=allowed.halves,
         effects=problem.effects(state.coefficients),
         began_away=_began_away(records, fit),
+        loaded=problem.load is not None,
         friction=problem.dry_friction(state.coefficients),
         to_explain=scale * _spread_beside(problem, state),
     )
