@@ -34,7 +34,7 @@ from relay_autotune.bag.field_path import (
     written,
 )
 from relay_autotune.bag.limits import MOST_ELEMENTS, MOST_STEPS
-from relay_autotune.bag.mcap_records import Channel, Content, every_byte, values_at
+from relay_autotune.bag.mcap_records import Channel, Content, values_at
 from relay_autotune.errors import BagError, FieldError, visible
 
 _ENCAPSULATION = 4
@@ -237,10 +237,10 @@ class _Cursor:
         at = np.flatnonzero(fits & self.good)
         if at.size:
             begin = (self._origin + self._place)[at]
-            rows = every_byte(self._content, "u1")[begin[:, np.newaxis] + np.arange(size)]
+            rows = values_at(self._content, "u1", begin[:, np.newaxis] + np.arange(size))
             found[at] = (rows == np.frombuffer(wanted, dtype=np.uint8)).all(axis=1)
             ends = np.broadcast_to(np.asarray(length), found.shape)[at] > size
-            zero = every_byte(self._content, "u1")[np.where(ends, begin + size, begin)] == 0
+            zero = values_at(self._content, "u1", np.where(ends, begin + size, begin)) == 0
             found[at] &= zero | ~ends
         self._advance(length)
         return found

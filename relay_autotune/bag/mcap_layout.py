@@ -26,11 +26,12 @@ from relay_autotune.bag.mcap_records import (
     DamageError,
     Declarations,
     Opcode,
-    every_byte,
+    opcodes,
     record_offsets,
     summed_up,
     text,
     unsigned,
+    values_at,
 )
 from relay_autotune.bag.source import MAGIC, Source, expanding, file_records, record_body
 
@@ -333,7 +334,7 @@ class _Scan:
             if length <= self.source.largest:
                 piece = self.source.read(position, after)
             return self._take_loose(piece, position, after)
-        outside = np.flatnonzero(~np.isin(every_byte(piece, "u1")[offsets], _INSIDE))
+        outside = np.flatnonzero(~np.isin(opcodes(piece, offsets), _INSIDE))
         if outside.size:
             end = int(offsets[outside[0]])
         return self._take_loose(piece[:end], position, position + end)
@@ -399,7 +400,7 @@ def _take(summary: bytes, data_end: int, layout: Layout) -> ChunkIndex:
     offsets, end = record_offsets(summary)
     if end != len(summary):
         raise DamageError(f"a record of impossible length at {end}")
-    is_chunk = every_byte(summary, "u1")[offsets] == Opcode.CHUNK_INDEX
+    is_chunk = opcodes(summary, offsets) == Opcode.CHUNK_INDEX
     for at in offsets[~is_chunk].tolist():
         opcode, length = RECORD.unpack_from(summary, at)
         begin = at + RECORD.size
@@ -415,12 +416,15 @@ def _chunks(summary: bytes, offsets: IntArray, data_end: int) -> ChunkIndex:
     :param data_end: where the data end in the file.
     :raises DamageError: if one of them leads out of the data, or two overlap.
     """
-    size = _u64(summary, offsets + 1)
+    size = values_at(summary, "<u8", offsets + 1)
     body = offsets + RECORD.size
     # The length of the message indexes follows the list.
     if bool((size < _LIST + 8).any()):
         raise DamageError("a record is cut")
-    start, length = _u64(summary, body + _START), _u64(summary, body + _LENGTH)
+    start, length = (
+        values_at(summary, "<u8", body + _START),
+        values_at(summary, "<u8", body + _LENGTH),
+    )
     _demand(
         start >= len(MAGIC),
         length > RECORD.size,
@@ -429,13 +433,13 @@ def _chunks(summary: bytes, offsets: IntArray, data_end: int) -> ChunkIndex:
         start <= data_end,
         otherwise="a chunk outside of the data",
     )
-    listed = every_byte(summary, "<u4")[body + _LIST_LENGTH].astype(np.int64)
+    listed = values_at(summary, "<u4", body + _LIST_LENGTH).astype(np.int64)
     _demand(
         listed <= size.astype(np.int64) - _LIST - 8,
         listed % _ENTRY == 0,
         otherwise="a list of message indexes of impossible length",
     )
-    indexed = _u64(summary, body + _LIST + listed)
+    indexed = values_at(summary, "<u8", body + _LIST + listed)
     end = (start + length).astype(np.int64)
     _demand(
         indexed <= (data_end - end).astype(np.uint64),
@@ -464,8 +468,8 @@ def _entries(
     """
     before = np.cumsum(count) - count
     at = np.repeat(lists - _ENTRY * before, count) + _ENTRY * np.arange(int(count.sum()))
-    channel = every_byte(summary, "<u2")[at].astype(np.int64)
-    place = _u64(summary, at + 2)
+    channel = values_at(summary, "<u2", at).astype(np.int64)
+    place = values_at(summary, "<u8", at + 2)
     _demand(
         place >= np.repeat(end, count).astype(np.uint64),
         place < np.repeat(index_end, count).astype(np.uint64),
@@ -477,11 +481,6 @@ def _entries(
     ends = np.append(begin[order][1:], np.iinfo(np.int64).max)
     room[order] = np.minimum(ends, np.repeat(index_end, count)[order]) - begin[order]
     return channel, np.maximum(room - RECORD.size - _PLACES, 0)
-
-
-def _u64(summary: bytes, at: IntArray) -> NDArray[np.uint64]:
-    found: NDArray[np.uint64] = every_byte(summary, "<u8")[at]
-    return found
 
 
 def _demand(*conditions: NDArray[np.bool_], otherwise: str) -> None:

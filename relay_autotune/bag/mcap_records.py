@@ -147,9 +147,9 @@ class Declarations:
         :raises DamageError: if one contradicts itself; the others are taken in.
         :raises BagError: if there are too many.
         """
-        opcodes = np.ndarray((len(content),), "u1", content)[offsets]
+        kinds = opcodes(content, offsets)
         damage: DamageError | None = None
-        declaring = offsets[(opcodes == Opcode.SCHEMA) | (opcodes == Opcode.CHANNEL)]
+        declaring = offsets[(kinds == Opcode.SCHEMA) | (kinds == Opcode.CHANNEL)]
         if declaring.size > MOST_DECLARATIONS:
             raise self._too_many()
         for at in declaring.tolist():
@@ -267,21 +267,6 @@ class Messages:
         return bytes(self.content[begin : min(end, begin + most)])
 
 
-def every_byte(content: Content, form: str | np.dtype[Any], shift: int = 0) -> NDArray[Any]:
-    """Return values that begin at each byte of some content, without a copy.
-
-    :param content: the bytes.
-    :param form: type of the values.
-    :param shift: where the first one begins.
-    :return: as many as fit.
-    """
-    kind = np.dtype(form)
-    count = max(len(content) - shift - kind.itemsize + 1, 0)
-    if count == 0:
-        return np.empty(0, dtype=kind)
-    return np.ndarray((count,), kind, content, shift, (1,))
-
-
 def values_at(content: Content, form: str, places: IntArray) -> NDArray[Any]:
     """Return the values at some places of some content.
 
@@ -289,14 +274,26 @@ def values_at(content: Content, form: str, places: IntArray) -> NDArray[Any]:
 
     :param content: the bytes.
     :param form: type of the values.
-    :param places: where each begins, and does not end behind the content, shape (n,).
+    :param places: where each begins, and does not end behind the content, of any shape.
+    :return: of the same shape.
     """
-    if places.size > 1:
+    kind = np.dtype(form)
+    if places.ndim == 1 and places.size > 1:
         first, step = int(places[0]), int(places[1] - places[0])
         even = step > 0 and int(places[-1]) - first == step * (places.size - 1)
         if even and bool((np.diff(places) == step).all()):
-            return np.ndarray(places.shape, form, content, first, (step,))
-    return every_byte(content, form)[places]
+            return np.ndarray(places.shape, kind, content, first, (step,))
+    if not places.size:
+        return np.empty(places.shape, kind)
+    # Those that begin at each byte, of which some are taken.
+    count = len(content) - kind.itemsize + 1
+    found: NDArray[Any] = np.ndarray((count,), kind, content, 0, (1,))[places]
+    return found
+
+
+def opcodes(content: Content, offsets: IntArray) -> NDArray[np.uint8]:
+    """Return the opcodes of the records that begin at some places."""
+    return values_at(content, "u1", offsets)
 
 
 def record_offsets(content: Content) -> tuple[IntArray, int]:
@@ -350,9 +347,9 @@ def _equal_records(content: Content, position: int, length: int) -> int:
     while held < most:
         count = min(tried, most - held)
         at = position + held * step
-        opcodes = np.ndarray((count,), "u1", content, at, (step,))
+        kinds = np.ndarray((count,), "u1", content, at, (step,))
         lengths = np.ndarray((count,), "<u8", content, at + 1, (step,))
-        equal = (opcodes != 0) & (lengths == length)
+        equal = (kinds != 0) & (lengths == length)
         if not bool(equal.all()):
             return held + int(np.argmin(equal))
         held += count
@@ -435,7 +432,7 @@ def _message_heads(
     content: Content, offsets: IntArray
 ) -> tuple[IntArray, NDArray[Any], IntArray, int]:
     """Return where messages begin, and their heads; where others do; the number of short ones."""
-    is_message = _opcodes(content, offsets) == Opcode.MESSAGE
+    is_message = opcodes(content, offsets) == Opcode.MESSAGE
     others, places = offsets[~is_message], _chosen(offsets, is_message)
     # Nearer to the end of the content only one that is too short begins.
     last = len(content) - _HEAD.itemsize
@@ -530,8 +527,3 @@ def nanoseconds(values: NDArray[np.uint64]) -> IntArray:
     if signed.size and int(signed.min()) < 0:
         signed[signed < 0] = np.iinfo(np.int64).max
     return signed
-
-
-def _opcodes(content: Content, offsets: IntArray) -> NDArray[np.uint8]:
-    found: NDArray[np.uint8] = every_byte(content, "u1")[offsets]
-    return found
