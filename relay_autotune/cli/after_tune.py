@@ -24,6 +24,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.cli.apply_gains import found_entries
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, as_typed, exit_status, say
 from relay_autotune.cli.loops import PATIENCE, Loop, Steps
@@ -75,7 +76,6 @@ from relay_autotune.exchange.messages import (
 from relay_autotune.loop.gains import Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes.gains_client import GainsClient
-from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.nodes.tables import FIXED, GAINS, parameters_of_law, rate_of
 from relay_autotune.reasons import Code
 from relay_autotune.record.record import Record

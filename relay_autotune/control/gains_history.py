@@ -27,7 +27,6 @@ from relay_autotune.reasons import Code
 # Number of earlier sets, and of failed and of doubtful sets, that are kept.
 KEPT = 20
 KNOWN = 1000
-# Why no change of the gains may begin now.
 # Numbers with a smaller relative difference are equal.
 _EQUAL = 1e-9
 

@@ -16,6 +16,7 @@ from typing import Any
 import yaml
 from rosidl_parser import definition
 
+from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.bag.field_path import (
     Number,
     Repeated,
@@ -29,8 +30,6 @@ from relay_autotune.bag.field_path import (
     steps_of,
 )
 from relay_autotune.errors import FieldError, ParameterError
-
-FLOAT64 = "std_msgs/msg/Float64"
 
 # Sequences that a message must have of the same length, or its consumer reads beyond an end.
 _ALIKE = {"control_msgs/msg/MultiDOFCommand": ("dof_names", "values", "values_dot")}

@@ -25,8 +25,6 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from relay_autotune.bag.writer import Qos
 
-FLOAT64_TYPE = "std_msgs/msg/Float64"
-
 # All of these are reliable, which is rclpy's default as volatile is. A sensor may burst after a
 # stall of some milliseconds; at 1 kHz a depth of 1 loses samples.
 MEASUREMENT = QoSProfile(depth=100)
@@ -126,7 +124,7 @@ def for_bag(profile: QoSProfile) -> Qos:
     )
 
 
-def why_no_publisher(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
+def why_no_publisher(node: Node, topic: str, kind: str) -> str:
     """Return why no measurement arrives on a topic, as far as the graph shows.
 
     :param node: the node that subscribes.
@@ -142,7 +140,7 @@ def why_no_publisher(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
     return f"{topic} has {_count(len(ends), 'publisher')}, but {why or 'nothing arrives'}"
 
 
-def why_no_subscriber(node: Node, topic: str, kind: str = FLOAT64_TYPE) -> str:
+def why_no_subscriber(node: Node, topic: str, kind: str) -> str:
     """Return why no node takes the command from a topic, as far as the graph shows.
 
     :param node: the node that publishes.

@@ -20,6 +20,9 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from relay_autotune.errors import ModelError, RelayAutotuneError, TuningError
+
+# Loaded now, though it is needed only for the first model: that comes in a tune, and loading takes
+# most of a second, in which no measurement would be answered.
 from relay_autotune.exchange import models  # noqa: F401
 from relay_autotune.exchange.evidence import ExperimentFacts, check_finding
 from relay_autotune.exchange.messages import (
@@ -115,9 +118,6 @@ def said_by(message: Any) -> tuple[str, bool, str]:
     told = message.message != _WORKING if working else message.level != DiagnosticStatus.OK
     return values.get(_EXPERIMENT, ""), working, message.message if told else ""
 
-
-# Loaded now, though it is needed only for the first model: that comes in a tune, and loading takes
-# most of a second, in which no measurement would be answered.
 
 # Limits on remembered experiments and logged reasons, since a node may send any number.
 _MOST = 8

@@ -31,6 +31,7 @@ from rclpy.serialization import serialize_message
 from rclpy.timer import Timer
 
 from relay_autotune.arrays import FloatArray
+from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
 from relay_autotune.errors import ParameterError, RecordError
 from relay_autotune.exchange.messages import (
@@ -557,7 +558,7 @@ class Recordings:
             [
                 Topic(
                     end.topic_name,
-                    MESSAGES.get(name, "std_msgs/msg/Float64"),
+                    MESSAGES.get(name, FLOAT64),
                     for_bag(end.qos_profile),
                 )
                 for name, end in self._ends().items()

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.control.controller import LARGEST_GAIN, LARGEST_VALUE, LONGEST_TIME, GainBounds
 from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN
@@ -17,7 +18,6 @@ from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAME
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate
 from relay_autotune.loop.sampled import Limits
-from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.quantities import Quantity
 
 NODE_PARAMETERS = (
@@ -138,7 +138,6 @@ TUNE_PARAMETERS: tuple[Quantity, ...] = (*EXPERIMENT_PARAMETERS, *NODE_PARAMETER
 
 # Names of the law that the node runs by itself.
 OWN_LAWS = ("", OWN_LAW)
-# Answer of ~/apply where no gains have come since the last were applied or discarded.
 GAINS = (
     Quantity("kc", 0.0, "u/y", -LARGEST_GAIN, LARGEST_GAIN).means(
         "Proportional gain, with the sign of the process; 0: no gains yet, the command is held."

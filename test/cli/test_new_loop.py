@@ -26,6 +26,7 @@ from made_experiments import record_of
 from rcl_interfaces.srv import SetParametersAtomically
 
 from relay_autotune import reasons as core
+from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.cli import loops, report, settings, terminal, tune_loop
 from relay_autotune.cli.after_tune import AfterTune, prefix
 from relay_autotune.cli.loops import Loop, TopicLoop
@@ -46,7 +47,6 @@ from relay_autotune.exchange.export import EXPORTS, Target, exported
 from relay_autotune.exchange.messages import fill_gains, fill_reason
 from relay_autotune.nodes import loop_client
 from relay_autotune.nodes.controller import with_gains_file
-from relay_autotune.nodes.live_types import FLOAT64
 from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.nodes.readiness import Checklist, answer_of
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS

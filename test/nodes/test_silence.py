@@ -17,13 +17,14 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
+from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.cli.own_nodes import free_domain
 from relay_autotune.errors import ParameterError
 from relay_autotune.exchange.messages import set_stamp
 from relay_autotune.nodes import gains_place, quality
 from relay_autotune.nodes.controller import ControllerNode
 from relay_autotune.nodes.gains_place import RemoteLoop
-from relay_autotune.nodes.live_types import FLOAT64, reader_of
+from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.watch import Repeater, require_own_time
 from relay_autotune.reasons import Code
 
