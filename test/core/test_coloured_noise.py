@@ -305,3 +305,33 @@ def test_an_integrator_that_is_driven_one_way_is_no_lag_of_many_records():
     assert found.model.model.integrators == 1
     assert found.model.model.gain == pytest.approx(6.0, rel=0.01)
     assert found.best_gains is not None
+
+
+def test_a_thermostat_that_began_off_its_rest_shows_the_direction_of_its_heater():
+    # The free start is seen beside two lags; beside one, the colour of the noise took its place.
+    record = _thermostat(np.random.default_rng(0))
+    found = identify_waveform(record)
+    assert found.model.process_sign > 0
+    assert found.fit.fit > 0.9
+    # Gain over time constant, and what delays.
+    assert found.model(0.01j) == pytest.approx(_KETTLE(0.01j), rel=0.1)
+
+
+_KETTLE = TransferFunction(1700.0, (), (3900.0, 9.6), 0, 8.5)
+
+
+def _thermostat(rng):
+    """Heat to 82 degC and hold it there by switching, with a part of the sensor still warm."""
+    step, time = 0.5, np.arange(0.0, 1812.0, 0.5)
+    slow, fast = np.exp(-step / 3900.0), np.exp(-step / 9.6)
+    heat = rise = 0.0
+    late, command, measured = [1.0] * 17, [], []
+    for t in time:
+        heat = slow * heat + (1.0 - slow) * 1700.0 * late[-17]
+        rise = fast * rise + (1.0 - fast) * heat
+        noisy = 20.0 + rise + 7.4 * np.exp(-t / 60.0) + 0.05 * rng.standard_normal()
+        measured.append(np.round(noisy, 1))
+        off, on = measured[-1] > 82.1, measured[-1] < 81.9
+        late.append(0.0 if off else 1.0 if on else late[-1])
+        command.append(late[-1])
+    return Record(time=time, measurement=np.array(measured), command=np.array(command))

@@ -215,11 +215,10 @@ def _with_best_terms(context: FitContext, found: Sequence[Candidate]) -> list[Ca
     They are added one after the other, each time the one that improves the score most in the
     colour of its own residual. Those far worse than the best are left out.
     """
-    ranked = sorted(found, key=lambda c: c.score)
-    # A command off the balance of an integrator looks like a drift.
-    starts = ranked[:1] + [c for c in ranked[1:] if c.structure in (FOPDT, IPDT, INTEGRATOR_LAG)]
     reached = []
-    for now in starts:
+    # A command off the balance of an integrator looks like a drift, and where a structure is too
+    # simple the colour explains what a term would.
+    for now in found:
         best = _in_own_colour(context, now)
         while more := context.with_one_more_term(now):
             pairs = [(_in_own_colour(context, c), c) for c in more]
