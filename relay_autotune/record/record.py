@@ -278,14 +278,12 @@ class Unthinned:
     """Properties of a record before its samples were averaged in blocks.
 
     :param samples: number of samples.
-    :param used: number of those that were averaged.
     :param interval: median time between them [s].
     :param noise: standard deviation of the noise of each [y].
     :param remark: what was done, a sentence.
     """
 
     samples: int
-    used: int
     interval: float
     noise: float
     remark: str

@@ -82,7 +82,9 @@ def test_a_folder_of_bags_is_a_table_with_a_line_each(tmp_path, capsys, more):
             assert told[name] == pytest.approx(gains[name], rel=1e-3)
     assert "broken.mcap  -" in rows[2] and len(rows[2]) < 100
     # The choice of columns counts as a matter of the command line.
-    assert (status, err) == (2, "")
+    assert status == 2
+    # Where the machine is slow, it is said how long a model will take.
+    assert all(line.startswith("computing the model") for line in err.splitlines())
 
 
 @pytest.mark.parametrize(

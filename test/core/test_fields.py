@@ -48,7 +48,15 @@ RESULTS = (
 UNTOLD = {
     *(
         (Identification, name)
-        for name in ("fitted", "effects", "friction", "began_away", "to_explain", "halves")
+        for name in (
+            "fitted",
+            "effects",
+            "friction",
+            "began_away",
+            "loaded",
+            "to_explain",
+            "halves",
+        )
     ),
     (LimitCycle, "std"),
 }

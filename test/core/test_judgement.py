@@ -410,3 +410,12 @@ def test_a_loop_slower_than_what_the_record_shows_is_doubtful(record, gains, sho
     s = 1j / last
     assert beyond.value == pytest.approx(1.0 / abs(found.model(s) * gains(s)), rel=1e-6)
     assert beyond.result is result
+
+
+@pytest.mark.parametrize(("share", "result"), [(0.3, Result.PASSED), (0.7, Result.DOUBTFUL)])
+def test_a_model_of_less_than_half_of_the_record_is_doubtful(record, gains, share, result):
+    found = fitted_as(PROCESS, record)
+    fitted = np.where(np.arange(len(record)) < share * len(record), math.nan, found.fitted)
+    of_part = of_checks(record, replace(found, fitted=fitted), gains)["left_out"]
+    assert of_part.result is result
+    assert of_part.value == pytest.approx(share, abs=0.01)

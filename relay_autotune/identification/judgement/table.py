@@ -155,6 +155,11 @@ def _direction(evidence: Evidence) -> Measured | None:
     return Measured(*max(shares)) if shares else None
 
 
+def _left_out(evidence: Evidence) -> Measured:
+    fitted = evidence.found.fitted
+    return Measured(float(np.isnan(fitted).mean()) if len(fitted) else 0.0)
+
+
 def _clipped(evidence: Evidence) -> Measured | None:
     found, record = evidence.found, evidence.record
     weak, strong = sorted(found.effects)
@@ -225,6 +230,18 @@ MODEL_CHECKS = (
         sentence="{value} of the measurement's variance is not explained",
         remedy="keep other inputs constant, or use a larger amplitude",
         measure=_share,
+    ),
+    Check(
+        name="left_out",
+        title="Left out",
+        what="share of the record that the model was not fitted to, since no model fits it "
+        "together with the rest",
+        unit="",
+        doubtful=0.5,
+        sentence="{value} of the record is left out: the model rests on the others",
+        remedy="repeat the test while nothing else acts on the process, and look whether the "
+        "actuator goes as far as its command",
+        measure=_left_out,
     ),
     Check(
         name="limit_cycle",
