@@ -39,9 +39,8 @@ test:
 	$(MAKE) --no-print-directory --jobs=3 --keep-going --output-sync=target \
 		test-system test-core test-rest lint || status=$$?; exit $$status
 
-# two files at a time: the core takes longest, and would have a processor alone at the end
 test-core: setup-tests
-	@$(ENTER) && nice $(PYTEST) --numprocesses=2 --dist=loadfile --no-loadscope-reorder test/core
+	@$(ENTER) && nice $(PYTEST) test/core
 
 # A machine that is busy with something else can miss the deadline of a running node: what failed
 # runs once more, by itself.
