@@ -31,6 +31,7 @@ from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.residuals import Colour, colour_of
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.excitation import changes_within
 from relay_autotune.record.record import PiecewiseConstant, Record
 
 _BINS = 48
@@ -311,8 +312,8 @@ class Evidence:
         time, fitted = self.record.time, self.found.fitted
         if len(fitted) == len(time) and np.isfinite(fitted).any():
             time = time[np.isfinite(fitted)]
-        changes = self.record.input().times
-        begin = np.min(changes[changes >= self.record.time[0]], initial=time[-1])
+        changes = changes_within(self.record.input(), self.record.time)
+        begin = np.min(changes, initial=time[-1])
         return float(time[-1] - max(begin, time[0]))
 
     def growth(self, model: TransferFunction) -> float:
