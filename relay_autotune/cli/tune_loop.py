@@ -21,6 +21,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from relay_autotune.cli.arguments import (
@@ -285,6 +286,7 @@ class Session:
                 for name, arguments in loop.arguments().items():
                     loop.nodes.start(name, arguments)
                 loop.client.why_lost = loop.nodes.why_lost
+                loop.client.why_ended = partial(loop.nodes.why_lost, "relay_node")
                 patience = max(patience, START_WITHIN)
         return patience
 

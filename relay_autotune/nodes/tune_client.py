@@ -30,9 +30,10 @@ from relay_autotune.record.record import Record
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
 
-# Silence after which relay_node counts as lost during a tune [s], in addition to the middleware's
-# liveliness lease.
-_GONE = 1.0
+# Another's relay_node counts as lost once it is missed for this time [s], in addition to the
+# middleware's liveliness lease: on a busy machine a living one was missed for up to 1.4 s. One
+# whose process has ended is heard for a while, since its last messages may be on their way.
+_GONE, _LAST_WORDS = 3.0, 1.0
 # How long messages are handled before the answer is looked for again [s].
 _TICK = 0.05
 # States of an ended goal; the safe command was sent before.
@@ -67,7 +68,10 @@ class TuneClient(LoopClient):
         self._feedback: list[Any] = []
         self._goal: Any = None
         self._answer: Any = None
-        self._seen = time.monotonic()
+        # For how long it was looked for in vain [s]; a pause between two looks shows nothing.
+        self._missed = 0.0
+        self.why_ended: Callable[[], str] | None = None
+        """Tells why the process of relay_node has ended, empty: it runs; None: it is another's."""
         self.left_behind = (
             "nobody publishes the command, and the last one stays in force; see to the plant"
         )
@@ -149,18 +153,30 @@ class TuneClient(LoopClient):
         """
         # A node that is lost during a tune is told with what that means for the plant.
         self._handle(self._answer.done, seconds)
-        if self._answer.done() or (self._alive and self._client.server_is_ready()):
-            self._seen = time.monotonic()
-        elif time.monotonic() - self._seen <= _GONE:
+        if self._answer.done() or not (why := self._why_gone(seconds)):
             return
-        elif self._goal.status in _ENDED:
+        if self._goal.status in _ENDED:
             raise LoopError(
                 f"{self.name} has ended, and the tune before it: the safe command is out; the log "
                 f"and the recording say how the tune ended"
             )
+        raise LoopError(f"during the tune {why}; {self.left_behind}".rstrip("; "))
+
+    def _why_gone(self, looked: float) -> str:
+        """Return why relay_node must be gone; empty: it is there, or may only be late.
+
+        A lease that has run out proves nothing where the process can be asked.
+
+        :param looked: for how long it was looked for [s].
+        """
+        if self.why_ended is not None:
+            why, limit = self.why_ended(), _LAST_WORDS
         else:
-            why = self.why_lost() or f"{self.name} has gone, or cannot be heard any more"
-            raise LoopError(f"during the tune {why}; {self.left_behind}".rstrip("; "))
+            is_there = self._alive and self._client.server_is_ready()
+            why = "" if is_there else f"{self.name} has gone, or cannot be heard any more"
+            limit = _GONE
+        self._missed = self._missed + looked if why else 0.0
+        return why if self._missed > limit else ""
 
     def _on_liveliness(self, info: Any) -> None:
         self._alive = info.alive_count > 0

@@ -198,6 +198,26 @@ def test_if_the_command_is_killed_its_nodes_end_with_the_safe_command(rig: Rig) 
     rig.until(lambda: heard[-1].data == 2.0, "the safe command")
 
 
+def test_a_node_that_starves_is_not_taken_for_gone_and_one_that_is_killed_is_missed_soon(
+    rig: Rig,
+) -> None:
+    heard = rig.listen("/tank/valve", Float64, RELIABLE)
+    rig.start("plant_node", *TOPICS, **FAST | {"time_constants": [50.0]})
+    process = begun(rig, "--record-only")
+    rig.until(lambda: any(m.data != 2.0 for m in heard), "a step", timeout=90.0)
+    (relay,) = nodes_of(process.pid)
+    os.kill(relay, signal.SIGSTOP)
+    # Four times the time in which a node has to renew its liveliness.
+    rig.run_for(4.0)
+    assert process.poll() is None
+    # What it leaves behind is removed with the rig.
+    rig.processes[0].segments |= mapped_segments(relay)
+    os.kill(relay, signal.SIGKILL)
+    _, said = process.communicate(timeout=15.0)
+    assert "during the tune relay_node was ended by signal 9 (Killed)" in said
+    assert "see to the plant" in said
+
+
 def test_a_command_at_which_the_process_does_not_rest_ends_the_tune(rig: Rig) -> None:
     heard = rig.listen("/tank/valve", Float64, RELIABLE)
     slow = {"time_constants": [5.0], "sample_period": 0.02, "gain": 5.0}
