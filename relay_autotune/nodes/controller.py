@@ -46,7 +46,7 @@ from relay_autotune.nodes.gains_place import (
     said,
 )
 from relay_autotune.nodes.goals import serve
-from relay_autotune.nodes.lifetime import ServedNode, run
+from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.parameters import ask_before_changes, declare, merged, values_of
 from relay_autotune.nodes.results import ResultCheck, why_doubtful
@@ -99,6 +99,8 @@ def _topics(file: str) -> dict[str, str]:
 # How long the end of the process waits for the acknowledgement of its last message.
 ACKNOWLEDGE = Duration(seconds=0.2)
 NAMES_OF_GAINS = frozenset(entry.name for entry in tables.GAINS)
+# Interval of the looks for a sensor that only offers best effort [s].
+_LOOK_EVERY = 0.2
 # How long the end of the process may wait for another node to restore its gains [s].
 END_WITHIN = 5.0
 
@@ -176,7 +178,9 @@ class ControllerNode(ServedNode):
         if values["repeat_period"] > 0.0:
             self._repeater = Repeater(self, values["repeat_period"], reader, self._on_silence)
         self._commands = quality.publisher(self, Float64, "controller_command", quality.COMMAND)
-        measurement = Following(self, reader, self._on_measurement).subscription
+        following = Following(self, reader, self._on_measurement)
+        measurement = following.subscription
+        self.create_timer(_LOOK_EVERY, following.look, clock=STEADY)
         if self._remote is None:
             self.create_subscription(Float64, "setpoint", self._on_setpoint, quality.COMMAND)
         if self._reported is None:

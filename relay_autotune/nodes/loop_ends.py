@@ -85,7 +85,6 @@ class RelayTopics:
     :param reader: how the measurement is read from its messages.
     :param now_ns: returns the time for the stamps of commands [ns].
     :param on_measurement: called with each measurement and the middleware's facts about it.
-    :param is_busy: tells whether a tune runs, in which no sample may be missed.
     :param on_result: called with the topic's unresolved name and each model or gains.
     :param on_status: called with each sign of life of the identifier.
     """
@@ -98,7 +97,6 @@ class RelayTopics:
         now_ns: Callable[[], int],
         *,
         on_measurement: Callable[[Any, dict[str, Any]], None],
-        is_busy: Callable[[], bool],
         on_result: Callable[[str, Any], None],
         on_status: Callable[[Any], None],
     ) -> None:
@@ -132,7 +130,7 @@ class RelayTopics:
         self.experiments = tells(ExperimentMessage, "relay_experiment", quality.RESULT)
         self.diagnostics = tells(DiagnosticArray, "/diagnostics", 1)
         self.reader = reader
-        self._sensor = watch.Following(node, reader, on_measurement, is_busy)
+        self.following = watch.Following(node, reader, on_measurement)
         self.models, self.gains = (
             quality.subscription(node, kind, name, partial(on_result, name), quality.RESULT)
             for kind, name in ((TransferFunction, "transfer_function"), (PidGains, "pi_gains"))
@@ -142,7 +140,7 @@ class RelayTopics:
     @property
     def measurement(self) -> Subscription:
         """The subscription of the measurement that is in force."""
-        return self._sensor.subscription
+        return self.following.subscription
 
     def recorded(self) -> dict[str, Any]:
         """Return the publishers and subscriptions to record, by the topics' unresolved names."""
@@ -258,21 +256,24 @@ class BumplessTransfer:
 
 # In takeover, number of the node's own last commands; they return to it over the topic.
 _OWN_KEPT = 256
-# Interval of the check of a controller that is passed through [s].
-_LOOK_EVERY = 0.05
+# The graph is looked at each fourth time.
+_OF_GRAPH = 4
 
 
 class LoopSupervisor:
-    """Watch the other nodes of the loop, and hand the command over and back.
+    """Watch the sensor and the other nodes of the loop, and hand the command over and back.
 
     :param node: relay_node.
     :param ends: its topics.
+    :param sensor: its measurement.
     :param stop: ends a running tune; takes the reason.
     """
 
-    def __init__(self, node: Any, ends: RelayTopics, stop: Callable[[Reason], None]) -> None:
+    def __init__(
+        self, node: Any, ends: RelayTopics, sensor: watch.Sensor, stop: Callable[[Reason], None]
+    ) -> None:
         self._node = node
-        self._ends = ends
+        self._ends, self._sensor = ends, sensor
         self._takeover = takeover = self._value("path") == "takeover"
         self._stop = stop
         self.handover = BumplessTransfer(ends.command.send)
@@ -281,7 +282,8 @@ class LoopSupervisor:
         self.commanded = math.nan
         """The last command of the tune [u]."""
         self._experiment: RelayExperiment | None = None
-        self._gives_back = False
+        self._overtime: watch.Overtime
+        self._gives_back = self._was_connected = False
         self._driven = False
         self.problem = ""
         """A problem that an operator must act on, or ""."""
@@ -289,7 +291,6 @@ class LoopSupervisor:
         self._feedback_at = math.inf
         self._follow: watch.FollowWatch | None = None
         self._own: deque[float] = deque(maxlen=_OWN_KEPT)
-        self._guard = watch.Guard(node, stop)
         self._hold = node.create_publisher(Bool, "hold_request", quality.RESULT)
         self._hold.publish(Bool(data=False))
         self._messages = ends.own.messages
@@ -301,7 +302,6 @@ class LoopSupervisor:
             hears(kind, "command", self._on_command, quality.COMMAND)
         elif not ends.is_reported:
             self._controller = hears(Float64, "controller_command", self._on_controller, often)
-            node.create_timer(_LOOK_EVERY, self._look, clock=STEADY)
         if self._value("command_others") == "other_commands":
             hears(kind, "other_commands", self._on_others, often)
         self.repeat_period: float = self._value("command_period")
@@ -310,6 +310,19 @@ class LoopSupervisor:
             # A command is between one and two looks old when it is sent again.
             node.create_timer(0.5 * self.repeat_period, self._send_again, clock=STEADY)
         hears(Float64, "command_feedback", self._on_feedback, often)
+        self._watches = (
+            watch.Watch(sensor.problem),
+            watch.Watch(self._several, every=_OF_GRAPH),
+            watch.Watch(self._second_commander, every=_OF_GRAPH),
+            watch.Watch(lambda: self._overtime.problem()),
+            watch.Watch(self._silent_controller),
+            watch.Watch(self._silent_feedback),
+            watch.Watch(self._hold_for_silent_controller, in_tune=None),
+            # No sample of a tune may be missed.
+            watch.Watch(ends.following.look, in_tune=False, every=_OF_GRAPH),
+        )
+        self._looks = 0
+        self._timer = node.create_timer(watch.LOOK_EVERY, self._look, clock=STEADY)
 
     def _value(self, name: str) -> Any:
         return self._node.get_parameter(name).value
@@ -343,11 +356,10 @@ class LoopSupervisor:
             raise NotReadyError(several)
         if self._ends.setpoint is not None and not self.is_connected:
             raise NotReadyError(Code.NO_CONTROLLER())
-        if self._takeover:
-            if self._driven and self.handover.age <= self._value("controller_timeout"):
+        if self._takeover and self._driven:
+            if self.handover.age <= self._value("controller_timeout"):
                 raise NotReadyError(Code.BUSY_COMMAND(topic=self._topic))
-            return
-        if problem := watch.second_publisher(self._node, self._topic):
+        elif problem := self._second_commander():
             raise NotReadyError(problem)
 
     def _several(self) -> Reason | None:
@@ -357,42 +369,28 @@ class LoopSupervisor:
             several = watch.second_source(self._node, self._controller)
         return several or watch.namesake(self._node)
 
+    def _second_commander(self) -> Reason | None:
+        """Return a reason if another node commands, which it may in takeover."""
+        return None if self._takeover else watch.second_publisher(self._node, self._topic)
+
     def take(self, experiment: RelayExperiment, *, gives_back: bool) -> None:
         """Take the command for a tune.
 
         :param experiment: the tune.
         :param gives_back: True if the controller gets the command back at once at any end.
         """
-        connected = self.is_connected
+        self._was_connected = self.is_connected
         self._experiment, self._gives_back = experiment, gives_back
+        self._overtime = watch.Overtime.of(experiment, self._node)
+        self._sensor.begin()
         self.commanded = math.nan
         if self._ends.setpoint is None:
             self.handover.take_over()
-        checks: list[watch.Check] = [watch.Overtime.of(experiment, self._node)]
-        of_graph = [self._several]
-        if not self._takeover:
-            of_graph.append(partial(watch.second_publisher, self._node, self._topic))
-        if connected:
-            timeout = self._value("controller_timeout")
-            reported = self._ends.is_reported
-            topic = (self._ends.measurement if reported else self._controller).topic_name
-            silent = partial(Code.SILENT_CONTROLLER, topic=topic)
-            checks.append(watch.silence(silent, timeout, lambda: self.handover.age))
-        timeout = self._value("feedback_timeout")
-        self._follow = None
-        if self._ends.setpoint is None:
             if not self._node.count_publishers("command_feedback"):
                 # No feedback now is no fault; feedback that starts later is checked from then on.
                 self._feedback_at = math.inf
+            timeout = self._value("feedback_timeout")
             self._follow = watch.FollowWatch(self._tolerance(experiment), timeout)
-            checks.append(
-                watch.silence(
-                    Code.SILENT_FEEDBACK,
-                    2.0 * timeout,
-                    lambda: time.monotonic() - self._feedback_at,
-                )
-            )
-        self._guard.begin(checks, of_graph)
         self._hold.publish(Bool(data=self._ends.setpoint is None))
 
     def _tolerance(self, experiment: RelayExperiment) -> Callable[[], float]:
@@ -413,7 +411,6 @@ class LoopSupervisor:
         :param experiment: the tune that ended.
         :param command: the actuator's present command [u].
         """
-        self._guard.end()
         self._hold.publish(Bool(data=False))
         self._experiment, self._follow = None, None
         period = experiment.cycles[-1].period if experiment.cycle_count else 0.0
@@ -435,6 +432,31 @@ class LoopSupervisor:
         )
 
     # Callbacks.
+
+    def _look(self) -> None:
+        """Let those look whose state it is: the only supervision in the node."""
+        self._looks += 1
+        for each in self._watches:
+            looks = each.in_tune in (None, self._experiment is not None)
+            if looks and self._looks % each.every == 0 and (reason := each.problem()):
+                self._stop(reason)
+        # A silent sensor is missed at once.
+        left = self._sensor.left if self._experiment is not None else math.inf
+        watch.again(self._timer, min(watch.LOOK_EVERY, left))
+
+    def _silent_controller(self) -> Reason | None:
+        if not self._was_connected:
+            return None
+        ends = self._ends
+        topic = (ends.measurement if ends.is_reported else self._controller).topic_name
+        silent = partial(Code.SILENT_CONTROLLER, topic=topic)
+        return watch.silence(silent, self._value("controller_timeout"), self.handover.age)
+
+    def _silent_feedback(self) -> Reason | None:
+        if self._follow is None:
+            return None
+        silent = time.monotonic() - self._feedback_at
+        return watch.silence(Code.SILENT_FEEDBACK, 2.0 * self._value("feedback_timeout"), silent)
 
     def _on_controller(self, message: Float64) -> None:
         passed = self.handover.hear(message.data)
@@ -489,8 +511,8 @@ class LoopSupervisor:
             at = {"command": self.commanded, "position": message.data, **self._follow.rail}
             self._stop(Code.NOT_FOLLOWING(**at))
 
-    def _look(self) -> None:
-        if not self.is_driven:
+    def _hold_for_silent_controller(self) -> None:
+        if self._takeover or self._ends.is_reported or not self.is_driven:
             return
         timeout = self._value("controller_timeout")
         if self.handover.age <= timeout:

@@ -74,14 +74,13 @@ class RelayNode(ServedNode):
             self._reader,
             self._now_ns if self._simulated else time.time_ns,
             on_measurement=self._on_measurement,
-            is_busy=lambda: self._session is not None,
             on_result=self._on_result,
             on_status=lambda status: self._recordings.told(*said_by(status)),
         )
         self._send, self._relay = self._ends.command.send, self._ends.relay.send
         self._on_setpoint = self._ends.setpoint is not None
-        self._loop = LoopSupervisor(self, self._ends, self._stop_now)
-        self._sensor = Sensor(self, self._reader, repeat=self._on_silence, stop=self._stop_now)
+        self._sensor = Sensor(self, self._reader, self._on_silence)
+        self._loop = LoopSupervisor(self, self._ends, self._sensor, self._stop_now)
         self._readiness = Readiness(self, self._ends, self._sensor, self._loop)
         self._hear = self._sensor.hear
         self._topic = self._ends.measurement.topic_name
@@ -236,7 +235,6 @@ class RelayNode(ServedNode):
         self._sensor.samples.forget()
         self._alarm = ""
         self._session = session
-        self._sensor.watch()
         self._loop.take(session.experiment, gives_back=policy.give_back)
         self.defer(self._narrator.now)
         return identity, recorded
@@ -328,7 +326,6 @@ class RelayNode(ServedNode):
             self._held, self._after = command, session.experiment.after_end
         self._session = None
         session.lost_samples = self._lost()
-        self._sensor.rest()
         self._loop.give_back(session.experiment, command)
         self.defer(partial(self._complete, session))
 

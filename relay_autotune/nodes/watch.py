@@ -11,8 +11,9 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,6 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.task import Future
-from rclpy.timer import Timer
 
 from relay_autotune.errors import FieldError, ParameterError
 from relay_autotune.experiment.experiment import RelayExperiment
@@ -32,9 +32,8 @@ from relay_autotune.nodes.live_types import Reader
 from relay_autotune.nodes.quality import who
 from relay_autotune.reasons import Code, Reason
 
-# Shortest period of a timer, and interval of the graph checks during a tune [s].
-_LEAST_WAIT = 1e-3
-_LOOK_EVERY = 0.2
+# Interval of the looks at the loop, and shortest period of a timer [s].
+LOOK_EVERY, _LEAST_WAIT = 0.05, 1e-3
 # The last samples that are kept, and the time that they may cover [s].
 _KEPT, _WINDOW = 2000, 10.0
 # The least time by which rest is told [s]: a drift shows in less only where it is fast.
@@ -131,13 +130,13 @@ class Repeater:
         now = self._now()
         if self._simulated:
             self._look_at_step(now)
-            _again(self._timer, _LEAST_WAIT)
+            again(self._timer, _LEAST_WAIT)
             return
         wait = self._repetition.wait(now)
         if wait <= 0.0:
             self._repeat(self._repetition.repeat(now), 0.0)
             wait = self._repetition.period
-        _again(self._timer, wait)
+        again(self._timer, wait)
 
     def _look_at_step(self, now: float) -> None:
         if self._is_due(now) and now > self._silent_at:
@@ -218,24 +217,17 @@ class Following:
     :param node: the node.
     :param reader: how the measurement is read from its messages.
     :param take: takes each message and the middleware's facts about it.
-    :param is_busy: tells whether the subscription has to stay now, since no sample may be missed.
     """
 
     def __init__(
-        self,
-        node: ServedNode,
-        reader: Reader,
-        take: Callable[[Any, dict[str, Any]], None],
-        is_busy: Callable[[], bool] = lambda: False,
+        self, node: ServedNode, reader: Reader, take: Callable[[Any, dict[str, Any]], None]
     ) -> None:
-        self._node, self._reader = node, reader
-        self._take, self._is_busy = take, is_busy
+        self._node, self._reader, self._take = node, reader, take
         self._favours = not node.get_parameter("use_sim_time").value
         self.subscription = self._subscribed(quality.MEASUREMENT, overridable=True)
         """The subscription in force."""
         given = f"qos_overrides.{self.subscription.topic_name}.subscription.reliability"
         self._is_given = given in node._parameter_overrides
-        node.create_timer(_LOOK_EVERY, self._look, clock=STEADY)
 
     def _subscribed(self, profile: QoSProfile, *, overridable: bool = False) -> Subscription:
         found: Subscription = quality.subscription(
@@ -250,11 +242,14 @@ class Following:
             self._node.favour(found)
         return found
 
-    def _look(self) -> None:
-        """Subscribe anew if a publisher is there that the subscription cannot hear."""
+    def look(self) -> None:
+        """Subscribe anew if a publisher is there that the subscription cannot hear.
+
+        To be called often, but not where no sample may be missed.
+        """
         old, profile = self.subscription, self.subscription.qos_profile
         is_best_effort = profile.reliability == ReliabilityPolicy.BEST_EFFORT
-        if self._is_busy() or self._is_given or is_best_effort:
+        if self._is_given or is_best_effort:
             return
         name = old.topic_name
         if self._node.count_publishers(name) <= old.get_publisher_count():
@@ -288,23 +283,13 @@ class Sensor:
     :param node: the node.
     :param reader: how the measurement is read from its messages.
     :param repeat: called as by :class:`Repeater`.
-    :param stop: called with the reason when a tune must end.
     """
 
-    def __init__(
-        self,
-        node: Any,
-        reader: Reader,
-        *,
-        repeat: Callable[[float, float], None],
-        stop: Callable[[Reason], None],
-    ) -> None:
+    def __init__(self, node: Any, reader: Reader, repeat: Callable[[float, float], None]) -> None:
         self._node = node
-        self._stop = stop
         self.repeat_period = period = float(node.get_parameter("repeat_period").value)
         """Silence after which a value is repeated [s]; 0: never."""
         self._repeater = Repeater(node, period, reader, repeat) if period > 0.0 else None
-        self._timer: Timer | None = None
         self.hear = self._repeater.hear if self._repeater else None
         """To be called with each measurement; None: no call needed."""
         self.samples = LastSamples()
@@ -312,7 +297,7 @@ class Sensor:
         self.misread: Reason | None = None
         """Why the last message could not be read; None: it could."""
         self.lost = 0
-        """Samples lost since `watch`, by the publisher's numbers."""
+        """Samples lost since `begin`, by the publisher's numbers."""
         self._arrived = -math.inf
         self._arrivals = self._arrivals_before = 0
         self._sequence = 0
@@ -350,45 +335,32 @@ class Sensor:
         """Return why nothing can be measured: its messages, or its publisher has left."""
         return self.misread or (None if self._repeater is None else self._repeater.why_dead())
 
-    @property
-    def _timeout(self) -> float:
-        return float(self._node.get_parameter("measurement_timeout").value)
-
-    def watch(self) -> None:
-        """Watch on the steady clock until :meth:`rest`, and count losses from here on."""
+    def begin(self) -> None:
+        """Begin a tune: count silence and losses from here on."""
         self.lost, self._arrived = 0, time.monotonic()
-        wait = self._timeout if self._repeater is None else _LOOK_EVERY
-        self._timer = self._node.create_timer(wait, self._look, clock=STEADY)
 
-    def rest(self) -> None:
-        """Stop watching."""
-        if self._timer is not None:
-            self._node.destroy_timer(self._timer)
-            self._timer = None
-
-    def _look(self) -> None:
-        if self._timer is None:
-            return
+    @property
+    def left(self) -> float:
+        """For how long its silence is no fault yet [s]."""
         if self._repeater is not None:
-            if reason := self.why_dead():
-                self._stop(reason)
-            return
-        age = self.since_message
-        if age < self._timeout:
-            _again(self._timer, self._timeout - age)
-            return
+            return math.inf
+        return float(self._node.get_parameter("measurement_timeout").value) - self.since_message
+
+    def problem(self) -> Reason | None:
+        """Return why a tune must end: it is silent, or with repetition its publisher has left."""
+        if self._repeater is not None:
+            return self.why_dead()
+        if self.left > 0.0:
+            return None
         topic = self._node.resolve_topic_name("measurement")
-        self._stop(Code.SILENT_SENSOR(topic=topic, silence=age))
+        return Code.SILENT_SENSOR(topic=topic, silence=self.since_message)
 
 
-def _again(timer: Any, wait: float) -> None:
+def again(timer: Any, wait: float) -> None:
+    """Let a timer fire after a time [s], and then at this interval."""
     timer.timer_period_ns = max(int(wait * 1e9), int(_LEAST_WAIT * 1e9))
     timer.reset()
 
-
-# Interval of the checks [s]; the graph is checked once in _GRAPH_EVERY of them.
-LOOK_EVERY = 0.05
-_GRAPH_EVERY = 4
 
 # Longest time for which the samples' time may stand still: a multiple of measurement_timeout or
 # repeat_period, and at least a number of seconds. Then the largest ratio of steady time to the
@@ -463,41 +435,18 @@ class FollowWatch:
         return late and self._stays.count(False) >= _MISSED
 
 
-Check = Callable[[], Reason | None]
-"""Returns a reason to end a tune, None while there is none."""
+@dataclass(frozen=True)
+class Watch:
+    """What looks at a loop.
 
-
-class Guard:
-    """Check the graph, the controller and the actuator every 50 ms while a tune runs.
-
-    :param node: the node that tunes.
-    :param stop: called with the reason when a check ends the tune.
+    :param problem: returns a reason to end a tune, None while there is none; it may also act.
+    :param in_tune: True: it looks while a tune runs; False: while none does; None: always.
+    :param every: it takes part in each look of this number: 1, or more where it queries the graph.
     """
 
-    def __init__(self, node: Node, stop: Callable[[Reason], None]) -> None:
-        self._stop = stop
-        self._timer = node.create_timer(LOOK_EVERY, self._look, clock=STEADY, autostart=False)
-
-    def begin(self, checks: Sequence[Check], of_graph: Sequence[Check]) -> None:
-        """Start the checks.
-
-        :param checks: those of each look.
-        :param of_graph: those of each fourth look, since they query the middleware.
-        """
-        self._checks, self._of_graph, self._looks = checks, of_graph, 0
-        self._timer.reset()
-
-    def end(self) -> None:
-        """Stop the checks."""
-        self._timer.cancel()
-
-    def _look(self) -> None:
-        self._looks += 1
-        of_graph = self._of_graph if self._looks % _GRAPH_EVERY == 0 else []
-        for check in (*of_graph, *self._checks):
-            if reason := check():
-                self._stop(reason)
-                return
+    problem: Callable[[], Reason | None]
+    in_tune: bool | None = True
+    every: int = 1
 
 
 class Arrival:
@@ -563,19 +512,14 @@ def _publishers(node: Node, topic: str, but: str = "") -> str:
     return " and ".join(names) or "another node"
 
 
-def silence(reason: Callable[..., Reason], timeout: float, age: Callable[[], float]) -> Check:
-    """Return a check of the silence of a signal, on the steady clock, for :class:`Guard`.
+def silence(reason: Callable[..., Reason], timeout: float, silent: float) -> Reason | None:
+    """Return a reason if a signal has been silent for too long.
 
     :param reason: takes the silence.
     :param timeout: longest silence [s].
-    :param age: returns the time since the last message [s].
+    :param silent: time since the last message [s].
     """
-
-    def look() -> Reason | None:
-        silent = age()
-        return reason(silence=silent) if silent > timeout else None
-
-    return look
+    return reason(silence=silent) if silent > timeout else None
 
 
 # The steady clock's time [s].
@@ -616,7 +560,7 @@ class Overtime:
             _SLACK_SIMULATED if simulated or by_number else _SLACK,
         )
 
-    def __call__(self) -> Reason | None:
+    def problem(self) -> Reason | None:
         """Return a reason if a limit is passed."""
         tune, present = self._experiment, now()
         if tune.elapsed != self._elapsed:

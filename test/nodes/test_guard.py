@@ -184,7 +184,7 @@ def test_a_tune_ends_by_the_steady_clock(monkeypatch, rate, most, duration, expe
     )
     present = 1000.0
     monkeypatch.setattr(watch, "now", lambda: present)
-    look, why = Overtime(tune, standing=5.0, slack=3.0), None
+    look, why = Overtime(tune, standing=5.0, slack=3.0).problem, None
     # An experiment that goes on by its own time ends by its own limit.
     while why is None and rate * (present - 1000.0) <= most:
         present += 0.05
