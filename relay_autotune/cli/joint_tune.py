@@ -35,7 +35,7 @@ from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.export import Target
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
 from relay_autotune.loop.gains import Controller
-from relay_autotune.nodes.gains_place import controller_of
+from relay_autotune.nodes.gains_place import gains_at, gains_text, put_gains
 from relay_autotune.nodes.live_types import CommandMessage, message_class
 from relay_autotune.nodes.loop_client import GoneError, LoopClient
 from relay_autotune.nodes.readiness import ChecklistLine, Mark
@@ -46,10 +46,8 @@ from relay_autotune.nodes.ros2_control import (
     ManagedController,
     Opened,
     forwarding,
-    gains_text,
     in_the_way,
     joint_loop,
-    put_gains,
 )
 from relay_autotune_msgs.action import Tune
 
@@ -517,10 +515,7 @@ class JointLoop(Loop):
 
         :raises LoopError: if it does not answer.
         """
-        places = self._loop.places
-        values = self._client.values(self._loop.node, list(places.values()))
-        found = {gain: values[place] for gain, place in places.items()}
-        return controller_of(found) if found["p"] else None
+        return gains_at(self._client, self._loop.node, self._loop.places)
 
     def first(self) -> Steps:
         """Return how to activate its controller before another tune, if it is not active."""

@@ -29,7 +29,7 @@ from relay_autotune.exchange.messages import (
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.gains_place import controller_of, in_another_node, mapping_of
+from relay_autotune.nodes.gains_place import gains_at, in_another_node, mapping_of, put_gains
 from relay_autotune.nodes.loop_client import ANSWER_WITHIN, GoneError, LoopClient
 from relay_autotune.nodes.tables import FIXED, GAINS, rate_from, rate_of
 from relay_autotune.process.transfer_function import TransferFunction
@@ -149,9 +149,9 @@ class GainsClient(LoopClient):
 
     def in_force(self) -> Controller | None:
         """Return the gains in force, also where another node has them; None: there are none."""
-        target, places, there = self._there()
+        target, places = self._there()
         if target:
-            return controller_of({gain: there[place] for gain, place in places.items()})
+            return gains_at(self, target, places)
         found = self.values(self.name, [entry.name for entry in GAINS])
         return Controller(**found) if found["kc"] else None
 
@@ -302,7 +302,8 @@ class GainsClient(LoopClient):
         """
         before = self.values(self.name, ("verify_step", "verify_step_max"))
         more = abs(setpoint) > max(map(abs, before.values()))
-        target, _, there = self._there()
+        target, places = self._there()
+        there = self.values(target, list(places.values())) if target else {}
         goal = Verify.Goal(setpoint_step=setpoint, load_step=load, patience=patience)
         if more:
             self.set_values(self.name, {"verify_step_max": abs(setpoint)})
@@ -318,17 +319,11 @@ class GainsClient(LoopClient):
                     self.set_values(self.name, {"verify_step_max": before["verify_step_max"]})
         return result
 
-    def _there(self) -> tuple[str, dict[str, str], dict[str, float]]:
-        """Return the other node that has the gains, its parameter for each, and their values.
-
-        Empty: there is none.
-        """
+    def _there(self) -> tuple[str, dict[str, str]]:
+        """Return the other node that has the gains, empty: none, and its parameter for each."""
         names = ("apply_to", "apply_parameters")
         target, mapping = self.values(self.name, names).values()
-        if not target:
-            return "", {}, {}
-        places = mapping_of(mapping)
-        return target, places, self.values(target, list(places.values()))
+        return target, mapping_of(mapping) if target else {}
 
     def _taken_back(self, target: str, before: dict[str, float]) -> str:
         """Bring back the gains of another node, whose controller_node is gone, and say so.
@@ -346,9 +341,8 @@ class GainsClient(LoopClient):
         told = ", ".join(f"{name} {value:.6g}" for name, value in before.items())
         with suppress(LoopError):
             if self.values(target, list(before)) != before:
-                self.set_values(target, before)
-            if self.values(target, list(before)) == before:
-                return f"{target} has {told}, as before{self.left_behind}"
+                put_gains(self, target, before, before)
+            return f"{target} has {told}, as before{self.left_behind}"
         return (
             f"{target} may have the new gains, which are not proven: start {self.name} again, "
             f"which brings {told} back"

@@ -29,6 +29,7 @@ from relay_autotune.loop.laws import LAWS, LawRate
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.nodes.live_types import CommandMessage, reader_of
+from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.nodes.tables import (
     GAINS,
     MESSAGE_PARAMETERS,
@@ -86,6 +87,49 @@ def controller_of(gains: Mapping[str, float]) -> Controller:
         gains.get("tf", 0.0),
         gains.get("b", 1.0),
     )
+
+
+def gains_at(client: LoopClient, node: str, places: Mapping[str, str]) -> Controller | None:
+    """Return the gains that another node has; None: it has none.
+
+    :param client: a node of the graph.
+    :param node: the other node's full name.
+    :param places: its parameter for each gain.
+    :raises RelayAutotuneError: if it does not answer, or they are not enough for a controller.
+    """
+    values = client.values(node, list(places.values()))
+    found = {gain: values[place] for gain, place in places.items()}
+    return controller_of(found) if found.get("kc", found.get("p")) != 0.0 else None
+
+
+def put_gains(
+    client: LoopClient, node: str, wanted: Mapping[str, float], before: Mapping[str, float]
+) -> None:
+    """Set the gains of a controller, all of them or none, and read them back.
+
+    :param client: a node of the graph.
+    :param node: full name of the controller's node.
+    :param wanted: the gains by the names of their parameters.
+    :param before: those in force, which are set again if others than the wanted are read.
+    :raises LoopError: if the controller does not have the wanted gains.
+    """
+    try:
+        client.set_values(node, wanted)
+        has = client.values(node, tuple(wanted))
+        if has != wanted:
+            raise LoopError(f"{node} has {gains_text(has)}, expected {gains_text(wanted)}")
+    except LoopError as error:
+        # An answer that is lost need not be a refusal.
+        try:
+            client.set_values(node, before)
+        except LoopError as left:
+            raise LoopError(f"{error}; and {left}: set {gains_text(before)} again") from None
+        raise LoopError(f"{error}; the gains are those of before: {gains_text(before)}") from None
+
+
+def gains_text(gains: Mapping[str, float]) -> str:
+    """Return gains in words, by the last part of their parameters."""
+    return ", ".join(f"{n.rpartition('.')[2]} {value:.6g}" for n, value in gains.items())
 
 
 def in_another_node(gains: Controller, rate: LawRate | None, feedforward: float) -> Control:

@@ -13,7 +13,7 @@ import json
 import math
 import shlex
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from types import TracebackType
@@ -33,7 +33,7 @@ _BACK_WITHIN = 15.0
 _LOOK_EVERY, _LOST_AFTER = 1.0, 5.0
 # Pause after a switch back that failed [s].
 _AGAIN = 0.2
-_ACTIVE, _INACTIVE = "active", "inactive"
+_ACTIVE = "active"
 _LIST = "/list_controllers"
 # Types that write what they are told into their command interfaces, and nothing else.
 _FORWARDING = {
@@ -700,36 +700,6 @@ def _of_trajectories(client: LoopClient, node: str) -> _Parts:
 
 
 _PARTS = {PID_CONTROLLER: _of_pid, TRAJECTORY_CONTROLLER: _of_trajectories}
-
-
-def put_gains(
-    client: LoopClient, node: str, wanted: Mapping[str, float], before: Mapping[str, float]
-) -> None:
-    """Set the gains of a controller, all of them or none, and read them back.
-
-    :param client: a node of the graph.
-    :param node: full name of the controller's node.
-    :param wanted: the gains by the names of their parameters.
-    :param before: those in force, which are set again if others than the wanted are read.
-    :raises LoopError: if the controller does not have the wanted gains.
-    """
-    try:
-        client.set_values(node, wanted)
-        has = client.values(node, tuple(wanted))
-        if has != wanted:
-            raise LoopError(f"{node} has {gains_text(has)}, expected {gains_text(wanted)}")
-    except LoopError as error:
-        # An answer that is lost need not be a refusal.
-        try:
-            client.set_values(node, before)
-        except LoopError as left:
-            raise LoopError(f"{error}; and {left}: set {gains_text(before)} again") from None
-        raise LoopError(f"{error}; the gains are those of before: {gains_text(before)}") from None
-
-
-def gains_text(gains: Mapping[str, float]) -> str:
-    """Return gains in words, by the last part of their parameters."""
-    return ", ".join(f"{n.rpartition('.')[2]} {value:.6g}" for n, value in gains.items())
 
 
 def _of_dof(client: LoopClient, node: str, dof: str) -> dict[str, Any]:

@@ -23,7 +23,12 @@ from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.loop import laws
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes import ros2_control
-from relay_autotune.nodes.gains_place import controller_of, in_another_node, mapping_of
+from relay_autotune.nodes.gains_place import (
+    controller_of,
+    in_another_node,
+    mapping_of,
+    put_gains,
+)
 from relay_autotune.nodes.loop_client import GoneError
 from relay_autotune.nodes.ros2_control import (
     TRAJECTORY_CONTROLLER,
@@ -37,7 +42,6 @@ from relay_autotune.nodes.ros2_control import (
     is_continuous,
     joint_loop,
     limits_in,
-    put_gains,
 )
 from relay_autotune.reasons import Code
 from relay_autotune_msgs.action import Tune
