@@ -35,20 +35,18 @@ from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.export import Target
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
 from relay_autotune.loop.gains import Controller
-from relay_autotune.nodes.gains_place import gains_at, gains_text, put_gains
-from relay_autotune.nodes.live_types import CommandMessage, message_class
-from relay_autotune.nodes.loop_client import GoneError, LoopClient
-from relay_autotune.nodes.readiness import ChecklistLine, Mark
-from relay_autotune.nodes.ros2_control import (
-    COMMAND_TYPE,
-    STATE_TYPE,
+from relay_autotune.nodes.controller_manager import (
     ControllerManager,
     ManagedController,
     Opened,
     forwarding,
     in_the_way,
-    joint_loop,
 )
+from relay_autotune.nodes.gains_place import gains_at, gains_text, put_gains
+from relay_autotune.nodes.joint_loop import COMMAND_TYPE, STATE_TYPE, joint_loop
+from relay_autotune.nodes.live_types import CommandMessage, message_class
+from relay_autotune.nodes.loop_client import GoneError, LoopClient
+from relay_autotune.nodes.readiness import ChecklistLine, Mark
 from relay_autotune_msgs.action import Tune
 
 _JOINT_STATES = "joint_states"

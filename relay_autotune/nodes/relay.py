@@ -28,8 +28,9 @@ from relay_autotune.nodes.loop_ends import LoopSupervisor, RelayTopics
 from relay_autotune.nodes.parameters import ask_before_changes, declare, values_of
 from relay_autotune.nodes.quality import NO_REPEAT_AFTER, why_no_publisher
 from relay_autotune.nodes.readiness import Checklist, Readiness, Ready, answer_of, require_settable
+from relay_autotune.nodes.recording import Recordings
 from relay_autotune.nodes.results import MODEL, OwnResults, said_by
-from relay_autotune.nodes.session import Recordings, Session, SetpointSession, reported_by
+from relay_autotune.nodes.session import Session, SetpointSession, reported_by
 from relay_autotune.nodes.tables import FIXED_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.nodes.watch import Arrival, Sensor
 from relay_autotune.reasons import Code, Reason, reason_of
@@ -210,6 +211,7 @@ class RelayNode(ServedNode):
         if self._on_setpoint:
             kind = partial(SetpointSession, actual=lambda: self._loop.handover.last)
         present = self.get_parameter("baseline_is_present").value
+        recording = self._recordings.begin(identity, self.get_parameter("record_directory").value)
         session = kind(
             RelayExperiment(
                 parameters,
@@ -220,14 +222,11 @@ class RelayNode(ServedNode):
                 from_small=ready.from_small,
                 before=self._sensor.samples.before() if present else None,
             ),
-            identity,
+            recording,
             sample_period=parameters.sample_period,
             clock=self._now_ns if self._simulated else None,
             repeats=self._hear is not None,
             one_clock=self._reported is not None,
-        )
-        session.sample, recorded = self._recordings.begin(
-            identity, self.get_parameter("record_directory").value
         )
         if not converged:
             sought = self.get_parameter("confident_of").value
@@ -237,7 +236,7 @@ class RelayNode(ServedNode):
         self._session = session
         self._loop.take(session.experiment, gives_back=policy.give_back)
         self.defer(self._narrator.now)
-        return identity, recorded
+        return identity, self._recordings.problem() or f"recorded in {recording.path}"
 
     # While a tune runs.
 
@@ -259,7 +258,7 @@ class RelayNode(ServedNode):
             return
         message = session.cycle_message(index)
         self._ends.cycles.publish(message)
-        self._recordings.message(session.id, "relay_cycle", session.now_ns(), message)
+        session.recording.message("relay_cycle", session.now_ns(), message)
 
     def _abort(self, _: Trigger.Request) -> str:
         session = self._session
@@ -305,7 +304,7 @@ class RelayNode(ServedNode):
         """End a tune at its client's wish, also one that waits for its model alone."""
         self._stop_now(Code.CANCELLED())
         if self._awaits_results is not None:
-            self._recordings.wait_no_longer(self._awaits_results.id, "cancelled")
+            self._awaits_results.recording.wait_no_longer("cancelled")
 
     def _stop(self, session: Session, reason: Reason) -> bool:
         """End a running tune; return True if the safe command was acknowledged."""
@@ -346,23 +345,23 @@ class RelayNode(ServedNode):
         self._publish_diagnostics()
         if session.sample_count:
             self._results.experiment(message)
-        self._recordings.message(session.id, "relay_experiment", session.now_ns(), message)
+        session.recording.message("relay_experiment", session.now_ns(), message)
         self._awaits_results = session
         self._action.tell(experiment, experiment.status)
         self.tidy_when_idle()
 
         def closed(missing: str) -> None:
             self._awaits_results = None
-            bag = self._recordings.path_of(session.id)
+            bag = "" if self._recordings.problem() else str(session.recording.path)
             summary = session.message(arrays=False)
             self._action.end(session.id, summary, bag, "; ".join(filter(None, (lost, missing))))
 
         if completed:
             timeout = self.get_parameter("model_timeout").value
-            self._recordings.close_with_results(session.id, timeout, closed)
+            session.recording.close_with_results(timeout, closed)
             self._narrator.now()
         else:
-            self._recordings.close(session.id, f"after a tune that was {outcome}")
+            session.recording.close(f"after a tune that was {outcome}")
             closed("")
 
     def end(self, reason: Reason) -> None:
@@ -387,7 +386,7 @@ class RelayNode(ServedNode):
         if (session := self._session) is None:
             waiting = self._awaits_results
             timeout = self.get_parameter("model_timeout").value
-            return "" if waiting is None else self._recordings.awaited(waiting.id, timeout)
+            return "" if waiting is None else waiting.recording.awaited(timeout)
         told = session.experiment.status
         if (age := self._sensor.age) > SILENT:
             told += f"; no measurement for {duration(age)}"

@@ -22,27 +22,30 @@ from relay_autotune.errors import LoopError
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.loop import laws
 from relay_autotune.loop.gains import Controller
-from relay_autotune.nodes import ros2_control
+from relay_autotune.nodes import controller_manager
+from relay_autotune.nodes import joint_loop as joint_loop_module
+from relay_autotune.nodes.controller_manager import (
+    ControllerManager,
+    ManagedController,
+    Opened,
+    above,
+    forwarding,
+    in_the_way,
+)
 from relay_autotune.nodes.gains_place import (
     controller_of,
     in_another_node,
     mapping_of,
     put_gains,
 )
-from relay_autotune.nodes.loop_client import GoneError
-from relay_autotune.nodes.ros2_control import (
+from relay_autotune.nodes.joint_loop import (
     TRAJECTORY_CONTROLLER,
-    ControllerManager,
     DofState,
-    ManagedController,
-    Opened,
-    above,
-    forwarding,
-    in_the_way,
     is_continuous,
     joint_loop,
     limits_in,
 )
+from relay_autotune.nodes.loop_client import GoneError
 from relay_autotune.reasons import Code
 from relay_autotune_msgs.action import Tune
 
@@ -318,10 +321,10 @@ def test_a_manager_that_is_gone_is_not_waited_for_beyond_the_time_of_the_way_bac
     now = [0.0]
     opened = Opened(Gone(), "one", ("pid",), lambda: asked.append("references"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ros2_control, "time", SimpleNamespace(monotonic=lambda: now[0]))
+        patch.setattr(controller_manager, "time", SimpleNamespace(monotonic=lambda: now[0]))
         with pytest.raises(LoopError, match=r"pid could not be .* \(no answer\).* type: type pid"):
             opened.close()
-    assert sum(asked) <= ros2_control._BACK_WITHIN
+    assert sum(asked) <= controller_manager._BACK_WITHIN
 
 
 class Arm:
@@ -374,7 +377,8 @@ class Arm:
 
 @pytest.fixture(autouse=True)
 def _messages_need_not_be_installed(monkeypatch):
-    monkeypatch.setattr("relay_autotune.nodes.ros2_control.interface_class", lambda *_: object)
+    for module in (controller_manager, joint_loop_module):
+        monkeypatch.setattr(module, "interface_class", lambda *_: object)
 
 
 def test_a_trajectory_controller_tells_joints_gains_state_and_law() -> None:

@@ -28,7 +28,11 @@ PROCESS = Process.fopdt(2.0, 1.0, 0.5)
 def session() -> Session:
     """Return an experiment whose relay has switched twice."""
     parameters = ExperimentParameters(amplitude=1.0, settle_time=0.1, hysteresis=0.01)
-    session = Session(RelayExperiment(parameters, 0.0, "own"), "own", one_clock=True)
+    session = Session(
+        RelayExperiment(parameters, 0.0, "own"),
+        SimpleNamespace(sample=lambda _: None),
+        one_clock=True,
+    )
     plant, command, count = FopdtPlant(2.0, 1.0, 0.5), 0.0, 0
     while session.experiment.switches < 2:
         stamp = 10**18 + 10_000_000 * count

@@ -19,9 +19,9 @@ from std_msgs.msg import Float64
 
 from relay_autotune import nodes
 from relay_autotune.cli.own_nodes import free_domain
-from relay_autotune.nodes import session
+from relay_autotune.nodes import recording as recording_module
+from relay_autotune.nodes.recording import RESULTS, Recordings
 from relay_autotune.nodes.results import SignsOfLife, said_by
-from relay_autotune.nodes.session import RESULTS, Recordings
 from relay_autotune_msgs.msg import PidGains, TransferFunction
 
 PATIENCE = 500
@@ -51,14 +51,14 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     for experiment, complete in (("whole", True), ("lacking", False)):
-        take, said = recordings.begin(experiment, str(tmp_path))
-        assert "recorded in" in said
-        take((1, 1, 1.0, 1, 0.5))
+        recording = recordings.begin(experiment, str(tmp_path))
+        assert recordings.problem() == "" and recording.path == tmp_path / experiment
+        recording.sample((1, 1, 1.0, 1, 0.5))
         if complete:
             for name, kind in results.items():
                 recordings.message(experiment, name, 2, kind(final=True))
         closed: list[str] = []
-        recordings.close_with_results(experiment, 0.05, closed.append)
+        recording.close_with_results(0.05, closed.append)
         # What the identifier is at goes on, as it says it.
         signs: list[Any] = []
         life = SignsOfLife(node)
@@ -70,7 +70,7 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
             (experiment, True, ""), (experiment, True, "comparing structures"),
         ]  # fmt: skip
         recordings.told(*said_by(signs[-1]))
-        waits_for = recordings.awaited(experiment, 0.05)
+        waits_for = recording.awaited(0.05)
         assert waits_for.endswith("s: comparing structures") is not complete
         # The identifier has sent all, of which the model was refused.
         recordings.told(experiment, False, "the model was refused")
@@ -83,8 +83,7 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
         assert ("the model was refused" in closed[0]) is not complete
         recordings.close_all("", 10.0)
         assert recordings.problem() == ""
-    recordings.begin("alone", str(tmp_path))
-    recordings.close_with_results("alone", 0.0, closed.append)
+    recordings.begin("alone", str(tmp_path)).close_with_results(0.0, closed.append)
     for _ in range(PATIENCE):
         if len(closed) > 1:
             break
@@ -100,20 +99,22 @@ def test_it_waits_as_long_as_the_identifier_gets_on(
     node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [0.0]
-    monkeypatch.setattr(session, "time", SimpleNamespace(monotonic=lambda: now[0], time_ns=int))
+    monkeypatch.setattr(
+        recording_module, "time", SimpleNamespace(monotonic=lambda: now[0], time_ns=int)
+    )
     topics = ("measurement", "command", *RESULTS)
     ends = {name: node.create_publisher(Float64, name, 10) for name in topics}
     recordings = Recordings(node, lambda: ends)
-    recordings.begin("slow", str(tmp_path))
+    recording = recordings.begin("slow", str(tmp_path))
     closed: list[str] = []
-    recordings.close_with_results("slow", 10.0, closed.append)
+    recording.close_with_results(10.0, closed.append)
     for stage in (*(f"stage {k}" for k in range(20)), *["the last one"] * 5):
         now[0] += 100.0
         recordings.told("slow", True, stage)
     assert now[0] == 2500.0
-    waits_for = recordings.awaited("slow", 10.0)
+    waits_for = recording.awaited(10.0)
     assert waits_for.startswith("waiting for identifier_node")
-    recordings.close("slow", "")
+    recording.close("")
     (reason,) = closed
     assert "has not got on from the last one for" in reason
     recordings.close_all("", 10.0)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,15 +18,17 @@ from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.nodes.quality import QUIET_AFTER_GO
 from relay_autotune.nodes.session import Session
 
+# Recordings that nobody looks at.
+UNKEPT = SimpleNamespace(sample=lambda _: None)
+
 
 def experiment() -> RelayExperiment:
     return RelayExperiment(ExperimentParameters(amplitude=1.0, settle_time=100.0), 0.5, "one")
 
 
 def test_samples_are_timed_by_their_source_stamps() -> None:
-    session = Session(experiment(), "one")
     kept: list[Any] = []
-    session.sample = kept.append
+    session = Session(experiment(), SimpleNamespace(sample=kept.append))
     start = 1_700_000_000_000_000_000
     for k, source in enumerate((start, start + 90_000_001, start + 210_000_000)):
         before = time.time_ns()
@@ -41,7 +44,7 @@ def test_samples_are_timed_by_their_source_stamps() -> None:
 
 
 def test_where_the_stamps_are_the_only_clock_a_simulation_may_run_at_any_pace() -> None:
-    session = Session(experiment(), "one", one_clock=True)
+    session = Session(experiment(), UNKEPT, one_clock=True)
     for k in range(300):
         # Half as fast as our clock, which the stamps would otherwise be held against.
         assert session.answer(1.0, 10_000_000 * (k + 1), 20_000_000 * k) == 0.5
@@ -54,7 +57,7 @@ def test_where_the_stamps_are_the_only_clock_a_simulation_may_run_at_any_pace() 
 
 
 def test_without_source_stamps_the_arrival_counts() -> None:
-    session = Session(experiment(), "one")
+    session = Session(experiment(), UNKEPT)
     for received in (10, 30, 60):
         session.answer(0.0, None, received * 10**9)
         session.answered()
@@ -63,7 +66,7 @@ def test_without_source_stamps_the_arrival_counts() -> None:
 
 def test_simulated_time_is_the_clocks() -> None:
     now = iter([5_000_000_000, 5_000_000_000, 5_100_000_000, 5_100_000_000])
-    session = Session(experiment(), "one", clock=lambda: next(now))
+    session = Session(experiment(), UNKEPT, clock=lambda: next(now))
     for _ in range(2):
         session.answer(0.0, time.time_ns(), time.time_ns())
         session.answered()
@@ -74,10 +77,9 @@ def test_simulated_time_is_the_clocks() -> None:
 
 
 def test_repeated_samples_and_arrivals_are_of_one_clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    session = Session(experiment(), "one", repeats=True)
-    start = 1_700_000_000_000_000_000
     kept: list[Any] = []
-    session.sample = kept.append
+    session = Session(experiment(), SimpleNamespace(sample=kept.append), repeats=True)
+    start = 1_700_000_000_000_000_000
     # The sensor's own clock is behind, and it was silent when the tune began.
     steps = [(0, True), (20, True), (33, False), (53, True), (52, False), (52, False), (60, False)]
     for milliseconds, repeated in steps:
@@ -99,7 +101,7 @@ def test_repeated_samples_and_arrivals_are_of_one_clock(monkeypatch: pytest.Monk
 
 def test_a_simulated_clock_that_goes_back_is_noticed_while_the_sensor_is_silent() -> None:
     now = [5_000_000_000]
-    session = Session(experiment(), "one", clock=lambda: now[0], repeats=True)
+    session = Session(experiment(), UNKEPT, clock=lambda: now[0], repeats=True)
     session.answer(4.0, time.time_ns(), time.time_ns())
     session.answered()
     now[0] = 5_400_000_000
@@ -116,7 +118,7 @@ class Lockstep:
     """A session by sample number, whose first sample was answered just now."""
 
     def __init__(self) -> None:
-        self.session = Session(experiment(), "one", sample_period=0.1)
+        self.session = Session(experiment(), UNKEPT, sample_period=0.1)
         self.session.answer(7.0, time.time_ns(), None)
         self.answered_at = time.time_ns()
         self.session.answered()
@@ -171,4 +173,4 @@ def test_a_sample_taken_for_a_repeat_is_answered_if_none_follows() -> None:
 
 def test_without_a_sample_there_is_no_record() -> None:
     with pytest.raises(RecordError, match="found none"):
-        Session(experiment(), "one").record()
+        Session(experiment(), UNKEPT).record()

@@ -1,0 +1,330 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""The recording of an experiment in relay_node, from its start until model and gains are in it.
+
+A thread writes it, so that no callback waits for a disk.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.serialization import serialize_message
+from rclpy.timer import Timer
+
+from relay_autotune.bag.definitions import FLOAT64
+from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
+from relay_autotune.nodes.lifetime import STEADY
+from relay_autotune.nodes.quality import for_bag
+from relay_autotune.text import duration
+
+# Flush interval: the longest part that a killed process can lose [s].
+FLUSH_PERIOD = 0.5
+
+# The thread writes PORTION samples at a time and then yields the interpreter to the relay [s].
+PORTION = 8
+PAUSE = 5e-4
+
+# Load the writer now, and not in the thread of the first experiment.
+with contextlib.suppress(ImportError):
+    import mcap.writer  # noqa: F401
+
+MESSAGES = {
+    "relay_cycle": "relay_autotune_msgs/msg/RelayCycle",
+    "relay_experiment": "relay_autotune_msgs/msg/RelayExperiment",
+    "transfer_function": "relay_autotune_msgs/msg/TransferFunction",
+    "pi_gains": "relay_autotune_msgs/msg/PidGains",
+}
+RESULTS = ("transfer_function", "pi_gains")
+
+# How long a start waits for the recording's folder [s].
+OPEN_WITHIN = 0.3
+# With signs of life of the identifier, one stage of its work may take this many times the timeout.
+LONGEST = 30.0
+# The identifier works as long as its last sign of life is not older than this [s].
+HEARD_WITHIN = 2.5
+# Wait after the identifier has finished, for messages that are still on their way [s].
+ON_THE_WAY = 0.5
+
+Sample = tuple[int, int, float, int, float]
+"""When a sample was received and measured [ns], the measurement, when it was answered [ns], and by
+which command."""
+
+
+class Recording:
+    """Record one experiment; any error becomes a sentence in `failure`, never an exception.
+
+    :param node: the node, whose timers and log are used.
+    :param ends: the publisher or subscription of each topic, by the topic's unresolved name:
+        ``measurement``, ``command`` and those of ``MESSAGES``.
+    :param path: the folder to create, with the name of the experiment.
+    """
+
+    def __init__(self, node: Node, ends: Mapping[str, Any], path: Path) -> None:
+        self.path = path
+        self.failure = ""
+        """What is wrong with it; empty: nothing is."""
+        self._node = node
+        self._names = {name: end.topic_name for name, end in ends.items()}
+        self._topics = [
+            Topic(end.topic_name, MESSAGES.get(name, FLOAT64), for_bag(end.qos_profile))
+            for name, end in ends.items()
+        ]
+        self._samples: SimpleQueue[Sample] = SimpleQueue()
+        self._messages: SimpleQueue[tuple[str, int, Any]] = SimpleQueue()
+        self._opened, self._closing = threading.Event(), threading.Event()
+        self._finished: Callable[[], None]
+        # The results that it lacks, and for how long it waits for them.
+        self._missing = list(RESULTS)
+        self._timer: Timer | None = None
+        self._until = self._patience = 0.0
+        self._waits_since = self._heard_at = -math.inf
+        self._reason = self._stage = ""
+        self._closed: Callable[[str], None] | None = None
+        # Looked up once, because it is called for each sample.
+        self.sample: Callable[[Sample], None] = self._samples.put
+        """Record a sample and its answer, once the answer is out."""
+        self._thread = threading.Thread(
+            target=self._run, args=(time.time_ns(),), name="recorder", daemon=True
+        )
+        self._thread.start()
+        self._opened.wait(OPEN_WITHIN)
+
+    @property
+    def is_closed(self) -> bool:
+        """True once nothing more can be recorded."""
+        return self._closing.is_set()
+
+    def message(self, name: str, time_ns: int, message: Any) -> None:
+        """Record another message; ignore it if the recording is closed.
+
+        :param name: unresolved name of the topic.
+        :param time_ns: when it was sent or received [ns since the epoch].
+        :param message: the message, which must not be changed afterwards.
+        """
+        if self.is_closed:
+            return
+        self._messages.put((self._names[name], time_ns, message))
+        if name in self._missing and message.final:
+            self._missing.remove(name)
+            if self._closed is not None and not self._missing:
+                self.close("with model and gains")
+
+    def told(self, working: bool, text: str) -> None:
+        """Take a sign of life of the identifier.
+
+        :param working: True if it still works on the experiment.
+        :param text: what the work is at, or why model or gains will not come; "": not told.
+        """
+        timer = self._timer
+        if timer is None:
+            return
+        if not working:
+            self._reason = text or self._reason
+            timer.timer_period_ns = min(timer.timer_period_ns, round(ON_THE_WAY * 1e9))
+            timer.reset()
+            return
+        now = time.monotonic()
+        if text != self._stage:
+            # It gets on.
+            self._until = now + self._patience
+        if now < self._until:
+            self._heard_at, self._stage = now, text
+            timer.reset()
+        else:
+            self._reason = (
+                f"identifier_node has not got on from {text or 'its first work'} for "
+                f"{duration(self._patience)}"
+            )
+
+    def awaited(self, timeout: float) -> str:
+        """Say what it waits for after the end of the tune; "" if it waits for nothing.
+
+        :param timeout: as of `close_with_results` [s].
+        """
+        if self._timer is None:
+            return ""
+        now = time.monotonic()
+        is_there = self._node.count_publishers(self._names["pi_gains"]) > 0
+        heard_at = max(self._heard_at, self._waits_since if is_there else -math.inf)
+        if heard_at > now - HEARD_WITHIN:
+            stage = f": {self._stage}" if self._stage else " so far"
+            return f"computing the model, {duration(now - self._waits_since)}{stage}"
+        silent = duration(now - max(self._waits_since, self._heard_at))
+        return f"waiting for identifier_node, {silent} of {duration(timeout)} at most"
+
+    def close_with_results(self, timeout: float, closed: Callable[[str], None]) -> None:
+        """Close it once model and gains are in it, or after a timeout.
+
+        :param timeout: how long to wait from the end, or from the last sign of life [s].
+        :param closed: called with a sentence on the missing results, "" if none is missing.
+        """
+        self._closed = closed
+        if not self._missing:
+            self.close("with model and gains")
+            return
+        silent = "a recording alone was asked for"
+        if timeout > 0.0:
+            silent = f"identifier_node did not send them within {timeout:g} s"
+        self._waits_since = time.monotonic()
+        self._patience = LONGEST * timeout
+        self._until = self._waits_since + self._patience
+        self._timer = self._node.create_timer(
+            max(timeout, 1e-3), lambda: self.wait_no_longer(silent), clock=STEADY
+        )
+
+    def wait_no_longer(self, reason: str) -> None:
+        """Close it without the results that it lacks.
+
+        :param reason: why they are missing, unless identifier_node has told another one.
+        """
+        self._reason = self._reason or reason
+        self.close(f"without {' and '.join(self._missing)}: {self._reason}")
+
+    def close(self, why: str) -> None:
+        """Close it, unless it is; its thread finishes it.
+
+        :param why: end of the sentence "the recording is closed ...".
+        """
+        if self.is_closed:
+            return
+        if self._timer is not None:
+            self._node.destroy_timer(self._timer)
+            self._timer = None
+        log, told = self._node.get_logger(), f"the recording {self.path} is closed {why}"
+        # A line of code has one severity; with another one the logger raises.
+        self._finished = lambda: log.info(told)
+        if self._closed is not None and self._missing:
+            self._finished = lambda: log.warning(told)
+        self._closing.set()
+        if self._closed is not None:
+            missing = " and no ".join(self._missing)
+            cause = f": {self._reason}" if self._reason else ""
+            self._closed(f"no {missing}{cause}" if missing else "")
+
+    def join(self, timeout: float) -> bool:
+        """Wait until the bag is finished, for ``timeout`` seconds at most; True if it is."""
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    # Its thread.
+
+    def _run(self, start_ns: int) -> None:
+        names = {name: self._names[name] for name in ("measurement", "command")}
+        try:
+            writer = BagWriter(
+                self.path,
+                self._topics,
+                start_ns=start_ns,
+                custom=names | {"experiment_id": self.path.name},
+            )
+            self._opened.set()
+            # Sleep for a period: a wake-up for each sample would compete with the relay.
+            while not self._closing.wait(FLUSH_PERIOD):
+                self._drain(writer)
+            self._drain(writer)
+            writer.close()
+            self._finished()
+        except Exception as error:  # noqa: BLE001  a recorder must not end an experiment
+            told = str(error) or type(error).__name__
+            self.failure = told if self._opened.is_set() else f"not recorded: {told}"
+            self._opened.set()
+            # Nothing is written after a failure, so the queues are emptied.
+            while not self._closing.wait(FLUSH_PERIOD):
+                for queue in (self._samples, self._messages):
+                    list(_taken_from(queue))
+
+    def _drain(self, writer: BagWriter) -> None:
+        command, measurement = self._names["command"], self._names["measurement"]
+        for count, (received, source, value, sent, answer) in enumerate(
+            _taken_from(self._samples), 1
+        ):
+            writer.write(measurement, received, source, encode_float64(value))
+            writer.write(command, sent, sent, encode_float64(answer))
+            if count % PORTION == 0 and not self._closing.is_set():
+                time.sleep(PAUSE)
+        for topic, time_ns, message in _taken_from(self._messages):
+            writer.write(topic, time_ns, time_ns, serialize_message(message))
+        writer.flush()
+
+
+def _taken_from(queue: SimpleQueue[Any]) -> Any:
+    """Yield what is in a queue."""
+    with contextlib.suppress(Empty):
+        while True:
+            yield queue.get_nowait()
+
+
+class Recordings:
+    """The recordings of a node's experiments.
+
+    :param node: the node, whose timers and log are used.
+    :param ends: returns what `Recording` takes.
+    """
+
+    def __init__(self, node: Node, ends: Callable[[], dict[str, Any]]) -> None:
+        self._node, self._ends = node, ends
+        # By experiment, the newest last.
+        self._kept: dict[str, Recording] = {}
+        self._reported = ""
+
+    def begin(self, experiment_id: str, directory: str) -> Recording:
+        """Open the recording of an experiment.
+
+        :param experiment_id: its id, which names the folder.
+        :param directory: where the folder is made.
+        """
+        folder = Path(directory).expanduser() / experiment_id
+        self._kept = {name: each for name, each in self._kept.items() if not each.is_closed}
+        self._kept[experiment_id] = recording = Recording(self._node, self._ends(), folder)
+        return recording
+
+    @property
+    def _newest(self) -> Recording | None:
+        return next(reversed(self._kept.values()), None)
+
+    def problem(self) -> str:
+        """Return what is wrong with the newest recording, or ""; a new problem is logged."""
+        problem = "" if self._newest is None else self._newest.failure
+        if problem and problem != self._reported:
+            self._reported = problem
+            self._node.get_logger().error(f"the tune goes on, but {problem}")
+        return problem
+
+    def message(self, experiment_id: str, name: str, time_ns: int, message: Any) -> None:
+        """Record a message of an experiment; ignore it if no such recording is open.
+
+        :param experiment_id: the id of the experiment.
+        """
+        if (recording := self._kept.get(experiment_id)) is not None:
+            recording.message(name, time_ns, message)
+
+    def told(self, experiment_id: str, working: bool, text: str) -> None:
+        """Take a sign of life of the identifier, as `Recording.told`.
+
+        :param experiment_id: the experiment that it works on, or has finished.
+        """
+        if (recording := self._kept.get(experiment_id)) is not None:
+            recording.told(working, text)
+
+    def close_all(self, why: str, timeout: float) -> None:
+        """Close all recordings and wait for the newest to be finished.
+
+        :param why: end of the sentence "the recording is closed ...".
+        :param timeout: how long to wait at most [s].
+        """
+        for recording in self._kept.values():
+            recording.close(why)
+        if (newest := self._newest) is not None and not newest.join(timeout):
+            self._node.get_logger().error(
+                f"the recording {newest.path} could not be finished within {timeout:g} s"
+            )
