@@ -13,7 +13,6 @@ from forward import peak_of_harmonics
 from sampled_relay import exact_limit_cycle
 from scipy.special import gammaincc
 
-from relay_autotune.errors import ModelError
 from relay_autotune.identification.methods.lags import fundamental, level, peak, peak_part
 from relay_autotune.process.structures import TWO_EQUAL_ONE
 from relay_autotune.process.transfer_function import TransferFunction
@@ -79,8 +78,3 @@ def test_a_square_wave_that_has_died_away():
     assert peak((1.0, 1.0), 1e4) == 1.0
     assert peak((1.0,), 1e4) == 1.0
     assert level((1.0, 1.0), 1e4, 0.5) == 1.0
-
-
-def test_other_patterns_of_lags_are_refused():
-    with pytest.raises(ModelError, match="expected equal ones"):
-        level((1.0, 2.0, 3.0), 1.0, 0.5)

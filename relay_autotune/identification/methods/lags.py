@@ -38,9 +38,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from scipy.optimize import brentq
-
-from relay_autotune.errors import IdentificationError, ModelError
+from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.process.structures import (
     FOPDT,
@@ -52,36 +50,36 @@ from relay_autotune.process.structures import (
 from relay_autotune.scalar import root
 
 _CLOSE = 0.25
-_TAYLOR = 15
+_TERMS = 15
 
 
 def level(time_constants: Sequence[float], period: float, part: float) -> float:
     """Return y/(K h) at a part m of the half period in which the square wave is up.
 
-    :param time_constants: equal ones, two, or three of which the first two are equal [s].
+    :param time_constants: equal ones, of which the last may differ from the others [s].
     :param period: P [s].
     :param part: m, from 0 to 1.
-    :raises ModelError: if the time constants are of another pattern.
     """
-    x = _ratios(time_constants, period)
-    value, factor = 0.0, 1.0
-    for ratio, difference in zip(x, _differences(part, x), strict=True):
-        value += factor * difference
+    x = [0.5 * period / tau for tau in time_constants]
+    # In a form without cancellation where x is small.
+    value = (math.expm1(-x[0]) - 2.0 * math.expm1(-part * x[0])) / (1.0 + math.exp(-x[0]))
+    factor = 1.0
+    for ratio, difference in zip(x, _differences(part, x)[1:], strict=False):
         factor *= -ratio
+        value += factor * difference
     return value
 
 
 def slope_sign(time_constants: Sequence[float], period: float, part: float) -> float:
     """Return a number with the sign of dy/dt at a part m of the upper half period.
 
+    The rate is the highest difference times the product of all -x.
+
     :param time_constants: as for :func:`level` [s].
     :param period: P [s].
     :param part: m, from 0 to 1.
     """
-    x = _ratios(time_constants, period)
-    if len(x) == 1:
-        return 1.0
-    # The rate is the highest difference times the product of -x.
+    x = [0.5 * period / tau for tau in time_constants]
     return (-1.0) ** len(x) * _differences(part, x)[-1]
 
 
@@ -94,14 +92,10 @@ def peak_part(time_constants: Sequence[float], period: float) -> float:
     :param time_constants: as for :func:`level` [s].
     :param period: P [s].
     """
-    x = _ratios(time_constants, period)
-    # Beyond this the effect of the half period before is below rounding.
-    if len(x) == 1 or min(x) > 50.0 + 5.0 * len(x):
+    if len(time_constants) == 1:
         return 0.0
-    # The amplitude there is flat, so that this accuracy gives it to the last digit.
-    return float(
-        brentq(lambda m: slope_sign(time_constants, period, m), 0.0, 1.0, xtol=1e-12, rtol=1e-9)
-    )
+    # Where all that was before has died away, the sign is rounding and the first end is taken.
+    return root(lambda m: slope_sign(time_constants, period, m), 0.0, 1.0, 1e-12)
 
 
 def peak(time_constants: Sequence[float], period: float) -> float:
@@ -113,10 +107,34 @@ def peak(time_constants: Sequence[float], period: float) -> float:
     :param time_constants: as for :func:`level` [s].
     :param period: P [s].
     """
-    part = peak_part(time_constants, period)
-    if part == 0.0 and len(time_constants) > 1:
-        return 1.0
-    return abs(level(time_constants, period, part))
+    return abs(level(time_constants, period, peak_part(time_constants, period)))
+
+
+def _differences(m: float, x: Sequence[float]) -> list[float]:
+    """Return the divided differences g[x1], g[x1, x2], ... of ``g = f - 1``."""
+    step, equal = x[-1] - x[0], len(x) - (x[-1] != x[0])
+    if step == 0.0:
+        return _series(m, x[0], equal)
+    if abs(step) < _CLOSE:
+        c = _series(m, x[0], _TERMS)
+        return [*c[:equal], sum(c[k] * step ** (k - equal) for k in range(equal, _TERMS))]
+    c, (last,) = _series(m, x[0], equal), _series(m, x[-1], 1)
+    for each in c:
+        last = (last - each) / step
+    return [*c, last]
+
+
+def _series(m: float, x: float, count: int) -> list[float]:
+    """Return the first coefficients of g(m, x + d) in powers of d, the quotient of two series."""
+    above, e = -2.0 * math.exp(-m * x), math.exp(-x)
+    below, found = [1.0 + e], [above / (1.0 + e)]
+    for k in range(1, count):
+        above *= -m / k
+        e /= -k
+        below.append(e)
+        rest = above - sum(below[j] * found[k - j] for j in range(1, k + 1))
+        found.append(rest / below[0])
+    return found
 
 
 def fundamental(time_constants: Sequence[float], period: float) -> float:
@@ -127,11 +145,6 @@ def fundamental(time_constants: Sequence[float], period: float) -> float:
     """
     w = 2.0 * math.pi / period
     return 4.0 / math.pi / math.prod(math.hypot(1.0, w * tau) for tau in time_constants)
-
-
-def _angle(time_constants: Sequence[float], period: float, part: float) -> float:
-    w = 2.0 * math.pi / period
-    return math.pi * part - sum(math.atan(w * tau) for tau in time_constants)
 
 
 def first_level(time_constants: Sequence[float], period: float, part: float) -> float:
@@ -151,58 +164,9 @@ def first_slope_sign(time_constants: Sequence[float], period: float, part: float
     return math.cos(_angle(time_constants, period, part))
 
 
-def _ratios(time_constants: Sequence[float], period: float) -> tuple[float, ...]:
-    half = 0.5 * period
-    return tuple(half / tau for tau in time_constants)
-
-
-def _differences(m: float, x: tuple[float, ...]) -> list[float]:
-    """Divided differences f[x1], f[x1, x2], ..."""
-    if all(ratio == x[0] for ratio in x):
-        return _taylor(m, x[0], len(x))
-    if len(x) == 2:
-        return [_taylor(m, x[0], 1)[0], _secant(m, x[0], x[1])]
-    if len(x) != 3 or x[0] != x[1]:
-        raise ModelError(
-            f"found {len(x)} lags; expected equal ones, two, or three of which the first two are "
-            "equal"
-        )
-    step = x[2] - x[0]
-    if abs(step) < _CLOSE:
-        c = _taylor(m, x[0], _TAYLOR)
-        third = sum(c[k] * step ** (k - 2) for k in range(2, _TAYLOR))
-    else:
-        c = _taylor(m, x[0], 2)
-        third = (_secant(m, x[0], x[2]) - c[1]) / step
-    return [c[0], c[1], third]
-
-
-def _taylor(m: float, x: float, count: int) -> list[float]:
-    """First coefficients of f(m, x + d) in powers of d, from the quotient of two series."""
-    e = math.exp(-x)
-    # In a form without cancellation where x is small.
-    found = [(math.expm1(-x) - 2.0 * math.expm1(-m * x)) / (1.0 + e)]
-    if count == 1:
-        return found
-    above, below = math.exp(-m * x), [1.0 + e]
-    quotient = [above / below[0]]
-    for k in range(1, count):
-        above *= -m / k
-        e /= -k
-        below.append(e)
-        rest = above - sum(below[j] * quotient[k - j] for j in range(1, k + 1))
-        quotient.append(rest / below[0])
-        found.append(-2.0 * quotient[-1])
-    return found
-
-
-def _secant(m: float, x1: float, x2: float) -> float:
-    """Divided difference (f(x2) - f(x1))/(x2 - x1), without cancellation."""
-    x1, x2 = min(x1, x2), max(x1, x2)
-    d = x2 - x1
-    rise = math.expm1(-m * d) - math.exp(-x1 - m * d) * math.expm1(-(1.0 - m) * d)
-    scale = math.exp(-m * x1) / ((1.0 + math.exp(-x1)) * (1.0 + math.exp(-x2)))
-    return -2.0 * scale * rise / d
+def _angle(time_constants: Sequence[float], period: float, part: float) -> float:
+    w = 2.0 * math.pi / period
+    return math.pi * part - sum(math.atan(w * tau) for tau in time_constants)
 
 
 @dataclass(frozen=True)
@@ -237,29 +201,6 @@ _WITH_LAG = 1.0 - 1e-6
 _NONE = 1e-12
 
 
-@dataclass(frozen=True)
-class _TwoConstants:
-    """Models between two orders of equal lags, by the share of a lag in the attenuation.
-
-    :param shares: from the parameter s to the share of each lag.
-    :param ends: of the branches of s, each of which holds one solution at most.
-    :param constants: places of the model's constants among the lags.
-    """
-
-    shares: Callable[[float], tuple[float, ...]]
-    ends: tuple[float, ...]
-    constants: tuple[int, int]
-
-
-# Between two equal lags and three there are two solutions, one with the larger constant repeated
-# and one with the smaller. Two equal lags are the end of the second branch, where the single one
-# vanishes.
-_TWO_CONSTANTS = {
-    MODEL_4: _TwoConstants(lambda s: (1.0 - s, s), (_NONE, 0.5), (0, 1)),
-    MODEL_5: _TwoConstants(
-        lambda s: (s, s, max(1.0 - 2.0 * s, 1e-13)), (_NONE, 1.0 / 3.0, 0.5), (1, 2)
-    ),
-}
 STRUCTURES = (FOPDT, LAG_N, MODEL_4, MODEL_5)
 
 
@@ -290,19 +231,24 @@ def solutions(
             "both the period and the amplitude; give the gain, or use the method li"
         )
     _require_possible(cycle, gain)
-    row, relative = _TWO_CONSTANTS[model], cycle.amplitude / (gain * cycle.relay)
+    count, relative = model.order - 1, cycle.amplitude / (gain * cycle.relay)
 
     def lags(*shares: float) -> tuple[float, ...]:
         return with_amplitude(shares, cycle.period, relative, wave)
 
     def excess(share: float) -> float:
-        return above(lags(*row.shares(share)))
+        return above(both(share))
+
+    def both(share: float) -> tuple[float, ...]:
+        return lags(*(share,) * count, max(1.0 - count * share, 1e-13))
 
     def above(time_constants: tuple[float, ...]) -> float:
         height = wave.level(time_constants, cycle.period, cycle.part)
         return height - cycle.level / (gain * cycle.relay)
 
-    low, middle, *more = row.ends
+    # The equal lags' share of the attenuation: from one lag alone to all equal. From there to
+    # two equal lags without the third, a second solution has the smaller constant alone.
+    low, middle, high = _NONE, 1.0 / model.order, 1.0 / count
     too_little = above(lags(1.0)) <= 0.0
     if too_little or excess(middle) > 0.0:
         what = "less lag than fopdt" if too_little else f"more lag than {model.order} equal lags"
@@ -312,9 +258,10 @@ def solutions(
             "time"
         )
     shares = [root(excess, low, middle)]
-    shares += [root(excess, middle, high) for high in more if excess(high) > 0.0]
-    found = [lags(*row.shares(share)) for share in shares]
-    return [(gain, *(each[i] for i in row.constants)) for each in found]
+    if count > 1 and excess(high) > 0.0:
+        shares.append(root(excess, middle, high))
+    ends = [(found[0], found[-1]) for found in map(both, shares)]
+    return [(gain, *(pair if count > 1 else pair[::-1])) for pair in ends]
 
 
 def equal(
