@@ -22,6 +22,7 @@ The dead time is read where a relay test shows it: by the sharp edge after a swi
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -29,7 +30,7 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.experiment.settling import ResponseDetector, RestState
+from relay_autotune.experiment.settling import NOT_SETTLED, ResponseDetector
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.limit_cycle.fold import Fold, Reading, fold, level_at_switch
 from relay_autotune.identification.limit_cycle.limit_cycle import (
@@ -55,7 +56,7 @@ from relay_autotune.identification.methods.solved import literally, solved, stru
 from relay_autotune.identification.result import Identification
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.structures import Structure, equal_lags
-from relay_autotune.record.record import Record, RelaySettings
+from relay_autotune.record.record import Record
 
 # Least jump of the rate at a sharp edge, relative to its largest value: that of one lag jumps by
 # more than 1 where the command arrives.
@@ -90,7 +91,7 @@ def read_dead_time(test: RelayTest, known: Known) -> tuple[float, float, str]:
         between = test.record.interval / math.sqrt(12.0 * len(cycles))
         scatter = float(np.nan_to_num(edge.std[0]))
         return value, max(scatter, between), source
-    first, interval = _first_response(test.record, settings)
+    first, interval = _first_response(test)
     if math.isnan(first):
         raise IdentificationError(
             "the dead time is not known, and neither sharp peaks nor a first kick from rest show "
@@ -114,31 +115,20 @@ def _is_sharp(curve: Fold) -> bool:
     return bool(abs(after - before) > _JUMP * float(np.percentile(steepest, 90.0)))
 
 
-def _first_response(record: Record, settings: RelaySettings) -> tuple[float, float]:
+def _first_response(test: RelayTest) -> tuple[float, float]:
     """Return the time from the first kick to the response, and the interval in which it began.
 
     NaN: there was no kick from rest.
     """
-    u = record.input()
+    record, u, settings = test.record, test.record.input(), test.settings
     resting = abs(u.initial - settings.baseline) < 0.5 * settings.amplitude
-    if u.times.size == 0 or not resting or u.times[0] < record.time[0]:
+    if not resting or not u.times.size or u.times[0] < record.time[0]:
         return math.nan, math.nan
     kick = float(u.times[0])
-    before = record.measurement[record.time <= kick]
-    noise = record.noise_std
-    if math.isnan(noise):
-        noise = float(np.std(before)) if before.size >= 10 else 0.0
+    mean = float(np.mean(record.measurement[record.time <= kick]))
     # Without noise, rounding remains.
-    floor = 1e-9 * float(np.ptp(record.measurement))
-    rest = RestState(
-        mean=float(np.mean(before)),
-        slope=0.0,
-        noise_std=max(noise, floor),
-        span=float(kick - record.time[0]),
-        samples=before.size,
-        range_seen=float(np.ptp(before)),
-    )
-    detector = ResponseDetector(rest, kick)
+    noise = max(record.noise, 1e-9 * float(np.ptp(record.measurement)))
+    detector = ResponseDetector(replace(NOT_SETTLED, mean=mean, noise_std=noise), kick)
     after = slice(int(np.searchsorted(record.time, kick, side="right")), None)
     for time, y in zip(record.time[after], record.measurement[after], strict=True):
         if detector.add(float(time), float(y)):
@@ -177,93 +167,16 @@ class SymmetricMethod:
     paper: str
     literal: Wave
 
-    def solve(
-        self, model: Structure, cycle: SymmetricCycle, gain: float, wave: Wave | None = None
-    ) -> list[Solution]:
-        """Return the solutions of a model.
-
-        Equal lags with a known gain have an equation too many: exactly their time constant is
-        that of the period; by the describing function it is the mean of both.
-
-        :param model: which one.
-        :param cycle: the limit cycle.
-        :param gain: K > 0 [y/u]; NaN: not known.
-        :param wave: which harmonics count; default: those of the method.
-        :raises IdentificationError: if there is none, or models 4 or 5 lack the gain.
-        """
-        wave = wave or self.wave
-        if wave is not FIRST or not model.equal_lags or math.isnan(gain):
-            return solutions(model, cycle, gain, wave)
-        by_amplitude = self._by_amplitude(model.order, cycle, gain)
-        # The phase needs no gain.
-        return [(gain, 0.5 * (by_amplitude + equal(model.order, cycle, wave=wave)[1]))]
-
-    def _by_amplitude(self, order: int, cycle: SymmetricCycle, gain: float) -> float:
-        relative = cycle.amplitude / (gain * cycle.relay)
-        return with_amplitude((1.0 / order,) * order, cycle.period, relative, self.wave)[0]
-
-    def excess(self, order: int, cycle: SymmetricCycle, gain: float, factor: float = 1.0) -> float:
-        """Return y/(K h) at the switch minus what it was, of n equal lags with the amplitude.
-
-        :param order: n >= 1.
-        :param cycle: the limit cycle.
-        :param gain: K > 0 [y/u].
-        :param factor: of the time constant.
-        :return: 0: period and amplitude agree; positive: the process has more lag.
-        :raises IdentificationError: if the gain is too small for the amplitude.
-        """
-        lags = (factor * self._by_amplitude(order, cycle, gain),) * order
-        height = self.wave.level(lags, cycle.period, max(cycle.part, 0.0))
-        return height - cycle.level / (gain * cycle.relay)
-
 
 # The describing function alone explains a difference of 0.1.
 CHANG = SymmetricMethod("chang", EXACT, 0.05, "eqs 8 to 12 and 21 to 25", MIXED)
 ATV = SymmetricMethod("atv", FIRST, 0.1, "eqs 6, 7, 13 and 21 to 25", FIRST)
 
 
-@dataclass(frozen=True)
-class Seen:
-    """A limit cycle, with the uncertainty of its numbers.
-
-    :param reading: period, amplitude, level at the switch and dead time, with what the relay
-        added to it.
-    :param relay: its amplitude [u].
-    :param test: the relay test; None: numbers of a chart.
-    :param source: of the dead time, a sentence for the user.
-    """
-
-    reading: Reading
-    relay: float
-    test: RelayTest | None = None
-    source: str = ""
-
-    @property
-    def cycle(self) -> SymmetricCycle:
-        """The limit cycle."""
-        period, amplitude, level, dead_time = self.reading.values.tolist()
-        return SymmetricCycle(period, amplitude, self.relay, level, dead_time)
-
-    @property
-    def extra_delay(self) -> float:
-        """Dead time that the relay added [s]."""
-        return self.test.settings.extra_delay if self.test else 0.0
-
-    def at(self, numbers: FloatArray) -> SymmetricCycle:
-        """Return the limit cycle with other numbers."""
-        period, amplitude, height, dead_time = numbers.tolist()
-        # The scatter about zero is that of the reading, to both sides.
-        level = min(height, _MOST_LEVEL * amplitude)
-        return SymmetricCycle(period, amplitude, self.relay, level, max(dead_time, 0.0))
-
-
-def seen_in(test: RelayTest, dead_time: float = 0.0, std: float = 0.0, source: str = "") -> Seen:
-    """Return the limit cycle of an unbiased relay test.
+def symmetric_reading(test: RelayTest) -> Reading:
+    """Return period, amplitude and level at the switch of an unbiased relay test, and a zero.
 
     :param test: the relay test.
-    :param dead_time: of the process [s].
-    :param std: its standard deviation [s].
-    :param source: where it comes from, a sentence for the user.
     """
 
     def measure(seen: Fold) -> FloatArray:
@@ -273,8 +186,158 @@ def seen_in(test: RelayTest, dead_time: float = 0.0, std: float = 0.0, source: s
     read = Reading.of(test.record, test.cycle.cycles, measure)
     # In noise the level may be below zero, where no relay switches.
     read.values[2] = min(max(read.values[2], 0.0), _MOST_LEVEL * read.values[1])
-    read = read.with_number(3, dead_time + test.settings.extra_delay, std)
-    return Seen(read, test.settings.amplitude, test, source)
+    return read
+
+
+@dataclass(frozen=True)
+class LagProblem:
+    """Lags that are sought for a limit cycle.
+
+    :param method: how.
+    :param reading: period, amplitude, level at the switch, and dead time with what the relay
+        added to it.
+    :param relay: its amplitude [u].
+    :param gain: K > 0 [y/u]; NaN: not known.
+    :param test: the relay test; None: numbers of a chart.
+    """
+
+    method: SymmetricMethod
+    reading: Reading
+    relay: float
+    gain: float
+    test: RelayTest | None = None
+
+    def at(self, numbers: FloatArray) -> SymmetricCycle:
+        """Return the limit cycle of some numbers."""
+        period, amplitude, height, dead_time = numbers.tolist()
+        # The scatter about zero is that of the reading, to both sides.
+        level = height if self.test is None else min(height, _MOST_LEVEL * amplitude)
+        return SymmetricCycle(period, amplitude, self.relay, level, max(dead_time, 0.0))
+
+    @property
+    def cycle(self) -> SymmetricCycle:
+        """The limit cycle that was read."""
+        return self.at(self.reading.values)
+
+    def solve(
+        self, model: Structure, cycle: SymmetricCycle | None = None, wave: Wave | None = None
+    ) -> list[Solution]:
+        """Return the solutions of a model.
+
+        Equal lags with a known gain have an equation too many: exactly their time constant is
+        that of the period; by the describing function it is the mean of both.
+
+        :param model: which one.
+        :param cycle: default: the one that was read.
+        :param wave: which harmonics count; default: those of the method.
+        :raises IdentificationError: if there is none, or models 4 or 5 lack the gain.
+        """
+        cycle, wave = cycle or self.cycle, wave or self.method.wave
+        if wave is not FIRST or not model.equal_lags or math.isnan(self.gain):
+            return solutions(model, cycle, self.gain, wave)
+        # The phase needs no gain.
+        both = self._by_amplitude(model.order, cycle) + equal(model.order, cycle, wave=wave)[1]
+        return [(self.gain, 0.5 * both)]
+
+    def misfit(self, model: Structure, solution: Solution) -> float:
+        """Return how far a solution's half cycles are from the record's; 0 without a record."""
+        if self.test is None:
+            return 0.0
+        return shape_misfit(self.test, model, self.cycle, solution)
+
+    def choice(self) -> tuple[Structure, str]:
+        """Return the simplest model that fits, and a sentence for the user.
+
+        :raises IdentificationError: if none has the limit cycle.
+        """
+        if math.isnan(self.gain):
+            return self._choice_by_shape()
+        excesses: dict[int, float] = {}
+        for order in range(1, _MOST_EQUAL + 1):
+            excesses[order] = self._excess(order, self.cycle)
+            if self._agrees(order, excesses[order]):
+                return equal_lags(order), ""
+            if excesses[order] < 0.0:
+                break
+        # Between two orders of equal lags lies a model with one lag more that differs.
+        between = {1: MODEL_1, 2: MODEL_4, 3: MODEL_5}.get(order)
+        nearest = min((n for n in excesses if n >= 3), key=lambda n: abs(excesses[n]), default=3)
+        return between if between and excesses[order] < 0.0 else equal_lags(nearest), ""
+
+    def _choice_by_shape(self) -> tuple[Structure, str]:
+        """Choose among equal lags by the shape of the half cycles.
+
+        Period and amplitude only give gain and time constant then.
+        """
+        away: dict[int, float] = {}
+        for order in range(1, _MOST_EQUAL + 1):
+            if order > 3 and min(away, key=away.__getitem__, default=0) < order - 1:
+                break
+            with suppress(IdentificationError):
+                (solution,) = self.solve(equal_lags(order))
+                away[order] = self.misfit(equal_lags(order), solution)
+        if not away:
+            # The error of the simplest model says what is wrong.
+            self.solve(MODEL_1)
+        model = equal_lags(min(n for n in away if alike(away[n], min(away.values()))))
+        why = "its simplicity" if self.test is None else "the shape of its half cycles"
+        return model, (
+            f"without the gain the structure is not checked: {model_text(model)} was taken for "
+            f"{why}; give the gain or the structure where they are known"
+        )
+
+    def disagreement(self, model: Structure) -> str:
+        """Return a sentence where period and amplitude do not agree on equal lags, else none."""
+        cycle, size = self.cycle, self.gain * self.relay
+        if math.isnan(self.gain) or not model.equal_lags or self._agree(model.order):
+            return ""
+        height = cycle.level + size * self._excess(model.order, cycle)
+        return (
+            f"period and amplitude do not agree on {model_text(model)}: with this amplitude the "
+            f"measurement would be {height:.3g} at the switch, where it was {cycle.level:.3g}; "
+            "the process is of another structure, or gain or dead time are not right"
+        )
+
+    def _by_amplitude(self, order: int, cycle: SymmetricCycle) -> float:
+        relative = cycle.amplitude / (self.gain * cycle.relay)
+        return with_amplitude((1.0 / order,) * order, cycle.period, relative, self.method.wave)[0]
+
+    def _excess(self, order: int, cycle: SymmetricCycle, factor: float = 1.0) -> float:
+        """Return y/(K h) at the switch minus what it was, of n equal lags with the amplitude.
+
+        :param order: n >= 1.
+        :param cycle: the limit cycle.
+        :param factor: of the time constant.
+        :return: 0: period and amplitude agree; positive: the process has more lag.
+        :raises IdentificationError: if the gain is too small for the amplitude.
+        """
+        lags = (factor * self._by_amplitude(order, cycle),) * order
+        height = self.method.wave.level(lags, cycle.period, max(cycle.part, 0.0))
+        return height - cycle.level / (self.gain * cycle.relay)
+
+    def _agree(self, order: int) -> bool:
+        """Return whether period and amplitude have the same time constant of n equal lags."""
+        shorter, longer = (
+            self._excess(order, self.cycle, math.exp(side * self.method.agreement))
+            for side in (-1, 1)
+        )
+        return longer <= 0.0 <= shorter
+
+    def _agrees(self, order: int, here: float) -> bool:
+        """Return whether they do within what is uncertain.
+
+        That is the scatter of the cycles, and half a sample interval of dead time.
+        """
+        if self._agree(order) or self.test is None:
+            return self._agree(order)
+
+        def excess(numbers: FloatArray) -> FloatArray:
+            return np.array([self._excess(order, self.at(numbers))])
+
+        read, half = self.reading, np.array((0.0, 0.0, 0.0, 0.5 * self.test.record.interval))
+        allowed = [abs(float(excess(read.values + s * half)[0]) - here) for s in (-1.0, 1.0)]
+        scatter = float(np.nan_to_num(read.quantile * math.sqrt(read.carried(excess)[0, 0])))
+        return abs(here) <= max(*allowed, scatter)
 
 
 def _from_record(
@@ -291,9 +354,11 @@ def _from_record(
     """
     test = relay_test(method.name, record)
     test.require_unbiased()
-    test.known_gain(known)
-    seen = seen_in(test, *read_dead_time(test, known))
-    return _identified(method, seen, known, ideal=test.settings.hysteresis == 0.0)
+    gain, settings = test.known_gain(known), test.settings
+    dead_time, std, source = read_dead_time(test, known)
+    reading = symmetric_reading(test).with_number(3, dead_time + settings.extra_delay, std)
+    problem = LagProblem(method, reading, settings.amplitude, gain, test)
+    return _identified(problem, known, source, ideal=settings.hysteresis == 0.0)
 
 
 def _from_numbers(method: SymmetricMethod, cycle: SymmetricCycle, known: Known) -> Identification:
@@ -305,8 +370,8 @@ def _from_numbers(method: SymmetricMethod, cycle: SymmetricCycle, known: Known) 
     :raises IdentificationError: if no such model has the limit cycle.
     """
     numbers = np.array((cycle.period, cycle.amplitude, cycle.level, cycle.dead_time))
-    seen = Seen(Reading(numbers), cycle.relay)
-    return _identified(method, seen, known, ideal=cycle.level == 0.0)
+    problem = LagProblem(method, Reading(numbers), cycle.relay, abs(known.gain))
+    return _identified(problem, known, "", ideal=cycle.level == 0.0)
 
 
 identify_chang = partial(_from_record, CHANG)
@@ -315,59 +380,51 @@ chang_from_numbers = partial(_from_numbers, CHANG)
 atv_from_numbers = partial(_from_numbers, ATV)
 
 
-def _identified(
-    method: SymmetricMethod, seen: Seen, known: Known, *, ideal: bool
-) -> Identification:
-    gain, cycle, test = abs(known.gain), seen.cycle, seen.test
+def _identified(problem: LagProblem, known: Known, source: str, *, ideal: bool) -> Identification:
+    method, cycle, test = problem.method, problem.cycle, problem.test
     sign = test.sign if test else (-1 if known.gain < 0.0 else 1)
+    extra_delay = test.settings.extra_delay if test else 0.0
     model, remark = structure_asked_for(method.name, known, STRUCTURES), ""
     if model is None:
-        choice = _choice_by_shape if math.isnan(gain) else _choice
-        model, remark = choice(method, seen, gain)
-    found = method.solve(model, cycle, gain)
-    if test is not None:
-        found = sorted(found, key=lambda each: shape_misfit(test, model, cycle, each))
-    taken, *others = found
+        model, remark = problem.choice()
+    taken, *others = sorted(problem.solve(model), key=lambda each: problem.misfit(model, each))
 
-    def values(numbers: FloatArray) -> tuple[float, ...]:
-        at = seen.at(numbers)
-        nearest = min(method.solve(model, at, gain), key=lambda each: _distance(each, taken))
+    def values(numbers: FloatArray) -> Solution:
+        at = problem.at(numbers)
+        nearest = min(problem.solve(model, at), key=lambda each: _distance(each, taken))
         return *nearest, at.dead_time
 
-    remarks = [seen.source, remark, *(test.remarks() if test else ())]
-    if model.equal_lags and not math.isnan(gain):
-        remarks.append(_disagreement(method, model, cycle, gain))
-    remarks += [
-        f"{model_text(model)} has two solutions, which period and amplitude do not tell apart: "
-        f"{_constants_text(taken)} was taken, {_constants_text(other)} would do as well"
-        for other in others
-    ]
-    how = f"{method.paper} for an ideal relay" + (
-        ", with the first harmonic of the amplitude," if method.literal is MIXED else ""
-    )
-    dead_time = cycle.dead_time - seen.extra_delay
-    ideally = replace(cycle, level=0.0)
-    remarks += literally(
-        how,
-        model,
-        lambda: (*method.solve(model, ideally, gain, method.literal)[0], dead_time),
-        (*taken, dead_time),
-    )
+    ideally, dead_time = replace(cycle, level=0.0), cycle.dead_time - extra_delay
+    first = ", with the first harmonic of the amplitude," if method.literal is MIXED else ""
     k_u, w_u = ultimate_estimate(cycle)
+    remarks = [
+        *(source, remark, *(test.remarks() if test else ()), problem.disagreement(model)),
+        *(
+            f"{model_text(model)} has two solutions, which period and amplitude do not tell "
+            f"apart: {_constants_text(taken)} was taken, {_constants_text(other)} would do as well"
+            for other in others
+        ),
+        *literally(
+            f"{method.paper} for an ideal relay{first}",
+            model,
+            lambda: (*problem.solve(model, ideally, method.literal)[0], dead_time),
+            (*taken, dead_time),
+        ),
+    ]
     if method is ATV and not ideal:
         remarks.append(
             f"eqs 1 and 2 give K_u = {k_u:.4g} and w_u = {w_u:.4g} rad/s, but the hysteresis "
             "keeps the limit cycle off the ultimate point; K_u and w_u are those of the model"
         )
     identification = solved(
-        *(method.name, model, values, seen.reading),
+        *(method.name, model, values, problem.reading),
         sign=sign,
-        extra_delay=seen.extra_delay,
+        extra_delay=extra_delay,
         remarks=remarks,
     )
     if method is not ATV or not ideal:
         return identification
-    spread = seen.reading.carried(lambda numbers: np.array(ultimate_estimate(seen.at(numbers))))
+    spread = problem.reading.carried(lambda x: np.array(ultimate_estimate(problem.at(x))))
     gain_std, frequency_std = np.sqrt(np.diag(spread)).tolist()
     return replace(
         identification,
@@ -389,90 +446,6 @@ def _constants_text(solution: Solution) -> str:
 
 def _distance(solution: Solution, other: Solution) -> float:
     return sum(abs(math.log(a / b)) for a, b in zip(solution[1:], other[1:], strict=True))
-
-
-def _choice(method: SymmetricMethod, seen: Seen, gain: float) -> tuple[Structure, str]:
-    """Choose the simplest model that fits, where the gain is known."""
-    excesses: dict[int, float] = {}
-    # Between two orders of equal lags lies a model with one lag more that differs.
-    between = {1: MODEL_1, 2: MODEL_4, 3: MODEL_5}
-    for order in range(1, _MOST_EQUAL + 1):
-        excesses[order] = method.excess(order, seen.cycle, gain)
-        if _agrees(method, seen, gain, order, excesses[order]):
-            return equal_lags(order), ""
-        if excesses[order] < 0.0:
-            if order in between:
-                return between[order], ""
-            break
-    return equal_lags(min((n for n in excesses if n >= 3), key=lambda n: abs(excesses[n]))), ""
-
-
-def _agree(method: SymmetricMethod, order: int, cycle: SymmetricCycle, gain: float) -> bool:
-    """Return whether period and amplitude have the same time constant of n equal lags."""
-    shorter, longer = (
-        method.excess(order, cycle, gain, math.exp(side * method.agreement)) for side in (-1, 1)
-    )
-    return longer <= 0.0 <= shorter
-
-
-def _agrees(method: SymmetricMethod, seen: Seen, gain: float, order: int, here: float) -> bool:
-    """Return whether they do within what is uncertain.
-
-    That is the scatter of the cycles, and half a sample interval of dead time.
-    """
-    cycle, read = seen.cycle, seen.reading
-    if _agree(method, order, cycle, gain) or seen.test is None:
-        return _agree(method, order, cycle, gain)
-
-    def excess(numbers: FloatArray) -> FloatArray:
-        return np.array([method.excess(order, seen.at(numbers), gain)])
-
-    half = np.array((0.0, 0.0, 0.0, 0.5 * seen.test.record.interval))
-    allowed = [abs(float(excess(read.values + s * half)[0]) - here) for s in (-1.0, 1.0)]
-    scatter = float(np.nan_to_num(read.quantile * math.sqrt(read.carried(excess)[0, 0])))
-    return abs(here) <= max(*allowed, scatter)
-
-
-def _disagreement(
-    method: SymmetricMethod, model: Structure, cycle: SymmetricCycle, gain: float
-) -> str:
-    if _agree(method, model.order, cycle, gain):
-        return ""
-    size = gain * cycle.relay
-    height = cycle.level + size * method.excess(model.order, cycle, gain)
-    return (
-        f"period and amplitude do not agree on {model_text(model)}: with this amplitude the "
-        f"measurement would be {height:.3g} at the switch, where it was {cycle.level:.3g}; the "
-        "process is of another structure, or gain or dead time are not right"
-    )
-
-
-def _choice_by_shape(method: SymmetricMethod, seen: Seen, gain: float) -> tuple[Structure, str]:
-    """Choose among equal lags by the shape of the half cycles.
-
-    Period and amplitude only give gain and time constant then.
-    """
-    cycle, test = seen.cycle, seen.test
-    away: dict[int, float] = {}
-    for order in range(1, _MOST_EQUAL + 1):
-        if order > 3 and (test is None or not away or min(away, key=away.__getitem__) < order - 1):
-            break
-        try:
-            (solution,) = method.solve(equal_lags(order), cycle, gain)
-        except IdentificationError:
-            continue
-        away[order] = 0.0
-        if test is not None:
-            away[order] = shape_misfit(test, equal_lags(order), cycle, solution)
-    if not away:
-        # The error of the simplest model says what is wrong.
-        method.solve(MODEL_1, cycle, gain)
-    model = equal_lags(min(n for n in away if alike(away[n], min(away.values()))))
-    why = "its simplicity" if test is None else "the shape of its half cycles"
-    return model, (
-        f"without the gain the structure is not checked: {model_text(model)} was taken for "
-        f"{why}; give the gain or the structure where they are known"
-    )
 
 
 def alike(misfit: float, least: float) -> bool:

@@ -189,12 +189,13 @@ def identify_fourier(record: Record, known: Known = NOTHING) -> Identification:
     harmonics = measured_points(test)
     points = _with_static_gain(test, record, harmonics, structure)
     fit = _fit(structure, known, sign, points)
-    cost, x = _nearest(fit, points)
+    cost, values = _nearest(fit, points)
+    x = fit.searched(values)
     if not structure.unstable:
-        harmonics = with_noise_about(structure.build(fit.values(x)), test, harmonics)
+        harmonics = with_noise_about(structure.build(values), test, harmonics)
         points = _with_static_gain(test, record, harmonics, structure)
         fit = _fit(structure, known, sign, points)
-        cost, x = fit.refined(x)
+        cost, x = fit.best((values,))
     values = fit.values(x)
     remarks = test.remarks(symmetric=False)
     freedom = points.numbers - fit.free.size
@@ -284,7 +285,7 @@ def _nearest(fit: Fit, points: _Points) -> tuple[float, FloatArray]:
     # Another period of dead time turns each harmonic by whole turns, and fits as well.
     values = fit.values(x)
     values[-1] %= 2.0 * math.pi * fit.unit
-    return cost, fit.searched(values)
+    return cost, values
 
 
 def _uncertainty(
@@ -300,17 +301,17 @@ def _uncertainty(
     :param x: where the sum of squares is least, shape (m,).
     :param between: how the ultimate point follows from model, frequencies and points.
     """
-    steps = fit.steps(x)
     # In the order of the residuals: all real parts, then the imaginary ones.
     places = np.arange(points.value.size)
     turned = places[points.frequency > 0.0]
     place = np.concatenate((places, turned))
+    steps = fit.steps(x)[: place.size]
     size = points.std[place] * np.repeat((1.0, 1j), (places.size, turned.size))
 
     def answer(deviations: FloatArray) -> FloatArray:
         moved = points.value.copy()
         np.add.at(moved, place, deviations * size)
-        there = fit.values(np.clip(x + deviations @ steps, *fit.ends))
+        there = fit.values(x + deviations @ steps)
         point = between(fit.structure.build(there), points.frequency, moved)
         ultimate = (math.nan,) * 2 if point is None else (point.gain, point.frequency)
         return np.append(there, ultimate)

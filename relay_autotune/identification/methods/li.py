@@ -18,8 +18,10 @@ Here it is fitted to periods and amplitudes themselves, which a model of lags pr
 from __future__ import annotations
 
 import cmath
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,11 +36,7 @@ from relay_autotune.identification.limit_cycle.limit_cycle import (
     SymmetricCycle,
     relay_test,
 )
-from relay_autotune.identification.methods.chang import (
-    alike,
-    seen_in,
-    shape_misfit,
-)
+from relay_autotune.identification.methods.chang import alike, shape_misfit, symmetric_reading
 from relay_autotune.identification.methods.lags import (
     MODEL_1,
     MODEL_4,
@@ -125,7 +123,6 @@ def fit_jointly(
     :raises IdentificationError: if the tests do not differ, or no such model comes near them.
     """
     require_difference(tests)
-    errors = errors or (CHART_ERRORS,) * len(tests)
     longest = 0.999 * min(0.5 * t.period - t.dead_time for t in tests)
     if not longest > 0.0:
         raise IdentificationError(
@@ -138,10 +135,13 @@ def fit_jointly(
             f"period for a switch to take effect: it must be below {longest:g} s"
         )
     measure = _of_cycle if exact else _of_point
+    deviations = np.array(errors or (CHART_ERRORS,) * len(tests))
+    # A point is as uncertain as its amplitude, in its phase too.
+    deviations = (deviations if exact else deviations[:, [1, 1]]).ravel()
 
     def residual(values: FloatArray) -> FloatArray:
-        pairs = zip(tests, errors, strict=True)
-        return np.array([r for test, error in pairs for r in measure(model, values, test, error)])
+        away = [each for test in tests for each in measure(model, values, test)]
+        return np.clip(np.array(away) / deviations, -_PENALTY, _PENALTY)
 
     given = np.full(len(model.names), math.nan)
     given[-1] = dead_time
@@ -155,9 +155,9 @@ def fit_jointly(
         )
     cost, x = fit.best(starts)
     values = fit.values(x)
-    if model == MODEL_4 and values[1] < values[2]:
-        values[1:3] = values[2], values[1]
-    misfit = math.sqrt(cost / (2 * len(tests)))
+    if model == MODEL_4:
+        values[1:3] = max(values[1:3]), min(values[1:3])
+    misfit = math.sqrt(cost / deviations.size)
     # A misfit above 1 shows that the assumed errors were too small.
     covariance = fit.covariance(fit.searched(values)) * max(misfit, 1.0) ** 2
     return JointFit(model, values, misfit, covariance)
@@ -211,56 +211,42 @@ def require_difference(tests: Sequence[SymmetricCycle]) -> None:
         )
 
 
-def _of_cycle(
-    model: Structure, values: FloatArray, test: SymmetricCycle, errors: tuple[float, float]
-) -> tuple[float, float]:
-    """Return how far period and amplitude are from the model's, to first order."""
-    process = model.build(np.abs(values))
-    gain, lags = process.gain, tuple(t.real for t in process.time_constants)
+def _of_cycle(model: Structure, values: FloatArray, test: SymmetricCycle) -> tuple[float, float]:
+    """Return how far period and amplitude are from the model's, relatively and to first order."""
+    gain, *constants, dead_time = np.abs(values).tolist()
+    lags = tuple(t.real for t in model.build((gain, *constants, dead_time)).time_constants)
 
     def excess(period: float) -> float:
-        part = 1.0 - 2.0 * (process.dead_time + test.dead_time) / period
+        part = 1.0 - 2.0 * (dead_time + test.dead_time) / period
         return level(lags, period, max(part, 0.0)) - test.level / (gain * test.relay)
 
     # The level at the switch grows with the period that is given to a model.
     step = 1e-4
     rise = (excess(test.period * (1 + step)) - excess(test.period * (1 - step))) / (2 * step)
-    missed = excess(test.period) / max(rise, 1e-9) / errors[0]
     # The response of extremely long lags is below rounding.
     amplitude = max(gain * test.relay * peak(lags, test.period), _TINY * test.amplitude)
-    return (
-        min(max(missed, -_PENALTY), _PENALTY),
-        math.log(amplitude / test.amplitude) / errors[1],
-    )
+    return excess(test.period) / max(rise, 1e-9), math.log(amplitude / test.amplitude)
 
 
-def _of_point(
-    model: Structure, values: FloatArray, test: SymmetricCycle, errors: tuple[float, float]
-) -> tuple[float, float]:
+def _of_point(model: Structure, values: FloatArray, test: SymmetricCycle) -> tuple[float, float]:
     """Return how far the logarithm of G is from that of the describing function's point."""
     w, point = describing_function_point(test)
-    away = cmath.log(abs(values[0]) / values[0] * complex(model.build(values)(1j * w)) / point)
-    return away.real / errors[1], away.imag / errors[1]
+    away = cmath.log(complex(model.build(np.abs(values))(1j * w)) / point)
+    return away.real, away.imag
 
 
 def _starts(
     model: Structure, tests: Sequence[SymmetricCycle], longest: float, dead_time: float
-) -> list[FloatArray]:
+) -> Iterator[FloatArray]:
     """Return values to begin from: each agrees with one test, for equal lags."""
     delays = [dead_time] if dead_time >= 0.0 else [share * longest for share in _DEAD_TIMES]
-    starts = []
-    for delay in delays:
-        for test in tests:
-            try:
-                cycle = replace(test, dead_time=delay + test.dead_time)
-                gain, tau = equal(model.order, cycle)
-            except IdentificationError:
-                continue
-            spreads = (1.0,) if model.equal_lags else (_SPREAD, 1.0 / _SPREAD)
-            for spread in spreads:
-                constants = (tau,) if model.equal_lags else (tau * spread, tau / spread)
-                starts.append(np.array((gain, *constants, delay)))
-    return starts
+    spreads = (
+        ((1.0,),) if model.equal_lags else ((_SPREAD, 1.0 / _SPREAD), (1.0 / _SPREAD, _SPREAD))
+    )
+    for delay, test in itertools.product(delays, tests):
+        with suppress(IdentificationError):
+            gain, tau = equal(model.order, replace(test, dead_time=delay + test.dead_time))
+            yield from (np.array((gain, *(tau * s for s in each), delay)) for each in spreads)
 
 
 def identify_li(record: Record, known: Known = NOTHING) -> Identification:
@@ -290,8 +276,8 @@ def identify_li_jointly(records: Sequence[Record], known: Known = NOTHING) -> Id
             "one of the tests had a reverse-acting relay and another did not: they are not of "
             "one process"
         )
-    seen = [seen_in(test) for test in tests]
-    readings, cycles = [each.reading for each in seen], [each.cycle for each in seen]
+    readings = [symmetric_reading(test) for test in tests]
+    cycles = [_cycle(*pair) for pair in zip(tests, readings, strict=True)]
     require_difference(cycles)
     errors = [_errors(test, read) for test, read in zip(tests, readings, strict=True)]
     candidates = fits_jointly(cycles, known, errors, tests[0].sign)
@@ -332,6 +318,13 @@ def _shape_misfit(
     delayed = [replace(cycle, dead_time=dead_time + cycle.dead_time) for cycle in cycles]
     pairs = zip(tests, delayed, strict=True)
     return math.hypot(*(shape_misfit(t, fit.model, c, (gain, *constants)) for t, c in pairs))
+
+
+def _cycle(test: RelayTest, read: Reading) -> SymmetricCycle:
+    """Return the limit cycle of a test, with the dead time that its relay added."""
+    period, amplitude, height, _ = read.values.tolist()
+    settings = test.settings
+    return SymmetricCycle(period, amplitude, settings.amplitude, height, settings.extra_delay)
 
 
 def _errors(test: RelayTest, read: Reading) -> tuple[float, float]:

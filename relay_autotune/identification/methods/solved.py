@@ -39,11 +39,13 @@ _EXACT = 1e-20
 # Step of derivatives, and distance that counts as at an end: in logarithms, or in units of time.
 _DIFFERENCE = 1e-4
 _AT_END = 1e-6
+# Weight of what is believed without any number.
+_FAINT = 1e-9
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Weighted least squares over measured numbers.
+    """Weighted least squares over measured numbers, in logarithms of all but the dead time.
 
     :param structure: of the model.
     :param given: its values; NaN: to be fitted, shape (p,).
@@ -67,33 +69,26 @@ class Fit:
         return np.flatnonzero(np.isnan(self.given))
 
     @cached_property
-    def _linear(self) -> NDArray[np.bool_]:
-        """Which of the fitted values are a dead time; the others are fitted as logarithms."""
-        return np.asarray(~self.structure.logarithmic[self.free])
-
-    @cached_property
-    def _scale(self) -> FloatArray:
-        return np.where(self._linear, self.unit, 1.0)
-
-    @cached_property
-    def ends(self) -> tuple[FloatArray, FloatArray]:
-        """Both ends of the search, shape (m,) each."""
+    def _range(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Both ends of the search, and its scale, shape (m,) each."""
+        linear = ~self.structure.logarithmic[self.free]
         longest = np.where(self.free == 0, _LARGEST, np.log(_LONGEST * self.unit))
-        low = np.where(self._linear, 0.0, -_LARGEST)
-        return low, np.where(self._linear, self.most, longest)
+        low, high = np.where(linear, 0.0, -_LARGEST), np.where(linear, self.most, longest)
+        return low, high, np.where(linear, self.unit, 1.0)
 
     def values(self, x: FloatArray) -> FloatArray:
-        """Return the values at a point of the search, shape (p,)."""
-        found = self.given.copy()
-        found[self.free] = np.where(self._linear, x, np.exp(np.where(self._linear, 0.0, x)))
-        if self.free.size and self.free[0] == 0:
-            found[0] *= self.sign
+        """Return the values at a point of the search, or at the end next to it, shape (p,)."""
+        found, (low, high, _) = self.given.copy(), self._range
+        logarithmic, x = self.structure.logarithmic[self.free], np.clip(x, low, high)
+        found[self.free] = np.where(logarithmic, np.exp(np.where(logarithmic, x, 0.0)), x)
+        found[0] = self.sign * abs(found[0])
         return found
 
     def searched(self, values: FloatArray) -> FloatArray:
         """Return the point of the search for some values, shape (m,)."""
         at = np.abs(values[self.free])
-        return np.where(self._linear, at, np.log(np.maximum(at, _SMALLEST)))
+        logarithms = np.log(np.maximum(at, _SMALLEST))
+        return np.where(self.structure.logarithmic[self.free], logarithms, at)
 
     def _errors(self, x: FloatArray) -> FloatArray:
         # A search that strays meets models without a value: they get a huge error.
@@ -101,75 +96,61 @@ class Fit:
             found = self.residual(self.values(x))
         return np.where(np.isfinite(found), found, _NO_VALUE)
 
-    def refined(self, x: FloatArray) -> tuple[float, FloatArray]:
-        """Return the least sum of squares and where it is, from a start."""
-        if x.size == 0:
-            return float(np.sum(self._errors(x) ** 2)), x
-        low, high = self.ends
-        solved = least_squares(
-            self._errors,
-            np.clip(x, low, high),
-            bounds=(low, high),
-            x_scale=self._scale,
-            xtol=1e-12,
-            ftol=1e-12,
-            gtol=1e-12,
-            max_nfev=_MOST_STEPS,
-        )
-        return 2.0 * float(solved.cost), solved.x
+    def _cost(self, x: FloatArray) -> float:
+        return float(np.sum(self._errors(x) ** 2))
 
     def best(self, starts: Sequence[FloatArray]) -> tuple[float, FloatArray]:
         """Return the least sum of squares and where it is, from the best of some values.
 
         :param starts: at least one, shape (p,) each.
         """
-        points = sorted(
-            (self.searched(s) for s in starts), key=lambda x: float(np.sum(self._errors(x) ** 2))
-        )
-        found = self.refined(points[0])
-        for x in points[1:_STARTS]:
+        low, high, scale = self._range
+        points = sorted((self.searched(s) for s in starts), key=self._cost)
+        found = self._cost(points[0]), points[0]
+        options = {"xtol": 1e-12, "ftol": 1e-12, "gtol": 1e-12, "max_nfev": _MOST_STEPS}
+        for start in points[:_STARTS] if self.free.size else ():
+            x = least_squares(
+                *(self._errors, np.clip(start, low, high)),
+                bounds=(low, high),
+                x_scale=scale,
+                **options,
+            ).x
+            found = min(found, (self._cost(x), x), key=lambda each: each[0])
             if found[0] < _EXACT:
                 break
-            found = min(found, self.refined(x), key=lambda each: each[0])
         return found
 
-    def covariance(self, x: FloatArray) -> FloatArray:
-        """Return the covariance of the values for numbers with the deviations told, shape (p, p).
-
-        :param x: where the sum of squares is least, shape (m,).
-        """
-        slope = np.where(self._linear, 1.0, self.values(x)[self.free])
-        found = np.zeros((self.given.size, self.given.size))
-        steps = self.steps(x) * slope
-        found[np.ix_(self.free, self.free)] = steps.T @ steps
-        return found
-
-    def steps(self, x: FloatArray) -> FloatArray:
+    def steps(self, x: FloatArray, faint: float = 0.0) -> FloatArray:
         """Return how the minimum moves with each measured number, by one standard deviation.
 
-        ``(J'J)^-1 J'`` with the derivatives J of the errors; a value at an end of its range stays
-        there.
+        ``(J'J)^-1 J'`` with the derivatives J of the errors, which is the implicit function
+        theorem; a value at an end of its range stays there.
 
         :param x: where the sum of squares is least, shape (m,).
-        :return: shape (n, m).
+        :param faint: weight of a belief in where each value is, as m numbers more: a value
+            without effect on the others is uncertain by its inverse.
+        :return: shape (n + m, m).
         """
-        low, high = self.ends
+        low, high, scale = self._range
+        linear = ~self.structure.logarithmic[self.free]
         # The largest dead time is a limit of the search, not of what the numbers allow.
-        above = np.where(self._linear, np.inf, high - x)
-        inside = np.flatnonzero(np.minimum(x - low, above) > _AT_END * self._scale)
-        size = np.minimum(_DIFFERENCE * self._scale, np.where(self._linear, 0.5 * x, np.inf))
+        above = np.where(linear, np.inf, high - x)
+        inside = np.minimum(x - low, above) > _AT_END * scale
+        size = np.minimum(_DIFFERENCE * scale, np.where(linear, 0.5 * x, np.inf))
+        slopes = jacobian(self._errors, x, np.where(inside, size, scale)) * scale * inside
+        slopes = np.concatenate((slopes, np.diag(faint * inside)))
+        return np.asarray(np.linalg.pinv(slopes).T * scale)
 
-        def errors(part: FloatArray) -> FloatArray:
-            at = x.copy()
-            at[inside] = part
-            return self._errors(at)
+    def covariance(self, x: FloatArray) -> FloatArray:
+        """Return the covariance of the values for numbers with the deviations given, shape (p, p).
 
-        steps = np.zeros((self._errors(x).size, x.size))
-        if inside.size:
-            scale = self._scale[inside]
-            steps[:, inside] = np.linalg.pinv(jacobian(errors, x[inside], size[inside]) * scale).T
-            steps[:, inside] *= scale
-        return steps
+        :param x: where the sum of squares is least, shape (m,).
+        """
+        found, free = np.zeros((self.given.size,) * 2), self.free
+        size = np.where(self.structure.logarithmic, self.values(x), 1.0)[free]
+        steps = self.steps(x, _FAINT) * size
+        found[np.ix_(free, free)] = steps.T @ steps
+        return found
 
 
 # Relative difference of two solutions that is worth a remark.
