@@ -17,6 +17,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from relay_autotune.analysis import Task, agreed, analyse, analyse_jointly
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.signals import CLOCKS, TIME_UNITS, Selection
@@ -233,7 +235,8 @@ def _from_rest(target: Target, record: Record | None) -> Target:
     """Return where gains go with units, and the command at which a record rests, if it does."""
     if record is None:
         return target
-    return replace(target, present=resting_command(record), units=record.units)
+    reach = float(np.abs(record.command).max())
+    return replace(target, present=resting_command(record), reach=reach, units=record.units)
 
 
 def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> str:

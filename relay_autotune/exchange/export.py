@@ -14,7 +14,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from relay_autotune.errors import ParameterError, SelectionError
@@ -44,6 +44,7 @@ class Target:
     :param command_min: lower clamp of the command [u]; -inf: none.
     :param command_max: upper clamp of the command [u]; inf: none.
     :param present: the command at which the process rests [u]; NaN: not known.
+    :param reach: the largest command of the record, without its sign [u]; NaN: not known.
     :param topics: names of the topics of a controller_node, by their names without a remapping.
     :param units: of the measurement, by "y", and of the command, by "u", as far as known.
     :param is_set_up: True if the gains are for its rate and its strategy against windup, which a
@@ -57,6 +58,7 @@ class Target:
     command_min: float = -math.inf
     command_max: float = math.inf
     present: float = math.nan
+    reach: float = math.nan
     topics: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     is_set_up: bool = False
@@ -170,6 +172,18 @@ def settings(gains: Gains, law: Law, target: Target) -> str:
         of_command = " Its command is in %, from {:g} to {:g}: scale it for the output.".format(
             *limits
         )
+    full = _full_command(law, target)
+    scale = law.full / full if full else 1.0
+    if law.turned and gains.kc < 0.0:
+        scale = -scale
+        of_command += f" {law.turned}."
+    if full:
+        of_command += (
+            f" It is {law.full:g} where the command is {full:g} u, so gains are divided by "
+            f"{full / law.full:g}."
+        )
+    low, high = sorted(scale * limit for limit in limits)
+    limits = low, high
     where = ""
     if law.bounds is None:
         ends = (f"{limit:g}" if math.isfinite(limit) else "none" for limit in limits)
@@ -185,21 +199,45 @@ def settings(gains: Gains, law: Law, target: Target) -> str:
     if law.sign:
         sign = law.sign.format(sign="positive" if gains.kc < 0.0 else "negative")
         told += (f"{sign}, with kc {gains.kc:.6g}.",)
-    values = list(_values(gains, law))
+    scaled = replace(gains, kc=scale * gains.kc)
+    values = list(_values(scaled, law))
     if law.bounds is not None:
         values += _texts(law.bounds(*limits))
     if law.start is not None:
         known = not math.isnan(target.present)
-        present, at = target.present, f" The process rested at {target.present:.6g} u."
+        present, at = scale * target.present, f" The process rested at {target.present:.6g} u."
         if not known:
             # A program that cannot do without one begins at the command next to 0.
             present = min(max(0.0, limits[0]), limits[1])
             at = f" It is not known here: put it in place of {present:g}." * law.start.needs
         told += (f"Start without a bump: {law.start.words}{at}",)
         if law.start.name and (known or law.start.needs):
-            start = law.start.value(law.at(gains, gains.law_period), present)
+            start = law.start.value(law.at(scaled, gains.law_period), present)
             values.append((law.start.name, number(start)))
     return _written(law, _comments(gains, told, law.remark), values)
+
+
+def _full_command(law: Law, target: Target) -> float:
+    """Return the command that is the largest of a program [u]; 0: commands are already its own.
+
+    :raises SelectionError: if commands are beyond the program's, and of what they are a share is
+        not known.
+    """
+    if not law.full:
+        return 0.0
+    if target.units.get("u") == "%":
+        return 100.0
+    limits = [abs(x) for x in (target.command_min, target.command_max) if math.isfinite(x)]
+    reach = max((x for x in (*limits, abs(target.present), target.reach) if x == x), default=0.0)
+    if reach <= law.full:
+        return 0.0
+    if not math.isfinite(target.command_max):
+        raise SelectionError(
+            f"the command of {law.name} is the {law.command}, and commands here go to {reach:g}: "
+            "say which is the largest, such as --command-max 255, and the lowest with "
+            "--command-min, or that they are in %, in the name of the column, such as 'out (%)'"
+        )
+    return max(limits)
 
 
 def node_parameters(gains: Gains, values: Mapping[str, Any], topics: Mapping[str, str]) -> str:

@@ -293,6 +293,9 @@ class Law:
     :param delay: samples until a command takes effect.
     :param form: of its gains, parallel (p, i, d) or ideal (gain and times).
     :param command: unit and scale of the command.
+    :param full: its largest command; 0: it may be any.
+    :param turned: what to know where a higher command lowers the measurement and its program takes
+        that command with the other sign; empty: it takes it as it is.
     :param only_positive: True if it has no gains for a process of negative gain.
     :param needs_integral: True if it does not run without integral action.
     :param head: what stands above its settings.
@@ -320,6 +323,8 @@ class Law:
     delay: int = 0
     form: str = "parallel"
     command: str = "any"
+    full: float = 0.0
+    turned: str = ""
     only_positive: bool = False
     needs_integral: bool = False
     head: str = ""
@@ -729,6 +734,9 @@ void startController() {
         ),
         smoothing=_MEAN,
         command="level of the output, -1 (cool) to 1 (heat)",
+        full=1.0,
+        turned="A higher command cools: let it be the cool_output, the negative half of the "
+        "output, so that gains are positive",
         head="climate:\n  - platform: pid\n    control_parameters:",
         line="      {name}: {value}",
         start=Start("starting_integral_term is the present command.", "starting_integral_term"),
@@ -748,6 +756,7 @@ void startController() {
         smoothing=_FIRST_ORDER,
         delay=1,
         command="power of the heater, 0 to 1; the gains are in parts of 255",
+        full=1.0,
         only_positive=True,
         head="# of printer.cfg; likewise [heater_bed] or [heater_generic NAME]\n"
         "[extruder]\ncontrol: pid",
@@ -771,6 +780,7 @@ void startController() {
         ),
         smoothing=_FIRST_ORDER,
         command="power of the heater, 0 to 1; the output is 0 to 255",
+        full=1.0,
         only_positive=True,
         line="#define {name} {value}",
         remark="//",
@@ -786,6 +796,7 @@ void startController() {
         integral=Integral.AFTER,
         slope=Slope.NONE,
         command="normalised torque",
+        full=1.0,
         line="param set {name} {value}",
         ending="txt",
     ),
@@ -812,6 +823,7 @@ void startController() {
         slope=Slope.ERROR,
         smoothing=_FIRST_ORDER,
         command="normalised torque",
+        full=1.0,
         line="{name},{value}",
         ending="param",
     ),

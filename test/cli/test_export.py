@@ -343,7 +343,8 @@ SHOW = "int main() { startController(); }"
 
 
 def test_a_printer_reads_its_heater():
-    text = exported(of_law("klipper_heater"), "klipper_heater", replace(OF_OVEN, command_max=0.8))
+    of_heater = Target(command_min=0.0, command_max=0.8, present=0.35)
+    text = exported(of_law("klipper_heater"), "klipper_heater", of_heater)
     printer = configparser.RawConfigParser(strict=False, inline_comment_prefixes=(";", "#"))
     printer.optionxform = str
     printer.read_string(text)
@@ -358,15 +359,79 @@ def test_a_printer_reads_its_heater():
 
 
 def test_esphome_gets_a_climate():
-    (climate,) = yaml.safe_load(exported(of_law("esphome_pid"), "esphome_pid", OF_OVEN))["climate"]
+    of_heater = Target(command_min=0.0, command_max=1.0, present=0.35)
+    (climate,) = yaml.safe_load(exported(of_law("esphome_pid"), "esphome_pid", of_heater))[
+        "climate"
+    ]
     assert climate["platform"] == "pid"
     assert climate["control_parameters"] == {
         "kp": 2.0,
         "ki": pytest.approx(0.4),
         "kd": 0.0,
         "output_averaging_samples": 1,
-        "starting_integral_term": 35.0,
+        "starting_integral_term": 0.35,
     }
+
+
+PERCENT = {"y": "°C", "u": "%"}
+
+
+@pytest.mark.parametrize(
+    ("law", "factor"), [("klipper_heater", 255.0), ("marlin_heater", 255.0), ("esphome_pid", 1.0)]
+)
+@pytest.mark.parametrize(
+    ("target", "full"),
+    [
+        (Target(units=PERCENT, reach=60.0), 100.0),
+        # The full command, not the limit, is what the program calls 1.
+        (Target(units=PERCENT, command_min=0.0, command_max=80.0), 100.0),
+        (Target(command_min=0.0, command_max=255.0, reach=200.0), 255.0),
+        (Target(reach=0.9), 1.0),
+        (Target(), 1.0),
+    ],
+    ids=["percent", "limited percent", "counts", "already", "unknown"],
+)
+def test_a_program_of_outputs_from_0_to_1_gets_gains_for_them(law, factor, target, full):
+    """Its loop is that of the record: gain times full command is the same in both."""
+    text = exported(of_law(law), law, target)
+    p, i, _ = gains_in(text)
+    assert full * p / factor == pytest.approx(2.0)
+    assert full * i / factor == pytest.approx(0.4)
+    assert (f"is 1 where the command is {full:g}" in text) == (full > 1.0)
+
+
+def gains_in(text: str) -> tuple[float, ...]:
+    """Return the three gains of a file, in its own words."""
+    found = settings_of(text)
+    named = {name.lower()[-2:]: value for name, value in found.items()}
+    return tuple(float(named[name]) for name in ("kp", "ki", "kd"))
+
+
+@pytest.mark.parametrize("law", [name for name, law in LAWS.items() if law.full])
+def test_commands_beyond_a_program_are_refused_where_their_full_range_is_not_known(law):
+    for beyond in (Target(reach=60.0), Target(present=60.0), Target(command_min=-5.0)):
+        with pytest.raises(SelectionError, match=r"commands here go to \d+: say .*--command-max"):
+            exported(of_law(law), law, beyond)
+
+
+def test_a_printer_gets_its_largest_power_in_its_own_scale():
+    limited = Target(units=PERCENT, command_min=0.0, command_max=80.0)
+    found = settings_of(exported(of_law("klipper_heater"), "klipper_heater", limited))
+    assert float(found["max_power"]) == pytest.approx(0.8)
+
+
+def test_esphome_cools_by_its_negative_half():
+    """Its kp is positive; cool_output gets -output (write_output_ of its pid_climate.cpp)."""
+    text = exported(
+        of_law("esphome_pid", -2.0), "esphome_pid", Target(units=PERCENT, present=30.0)
+    )
+    (climate,) = yaml.safe_load(text)["climate"]
+    found = climate["control_parameters"]
+    setpoint, measured = 20.0, 21.0
+    output = found["kp"] * (setpoint - measured) + found["starting_integral_term"]
+    # A degree too warm: 2 % more cooling than the 30 % at rest.
+    assert -output == pytest.approx(0.32)
+    assert "let it be the cool_output" in text
 
 
 @pytest.mark.parametrize(
@@ -380,10 +445,11 @@ def test_esphome_gets_a_climate():
 def test_a_program_starts_from_the_command_at_which_the_process_rests(law, name):
     unknown = exported(of_law(law, -2.0), law, Target())
     assert "Start without a bump" in unknown and name not in settings_of(unknown)
-    found = settings_of(exported(of_law(law, -2.0), law, Target(present=35.0)))
-    # Before it runs, the block of IEC 61131-3 gives KP X0; the others' first output is theirs.
-    factor = float(found["KP"]) if name == "X0" else 1.0
-    assert factor * float(found[name]) == pytest.approx(35.0)
+    found = settings_of(exported(of_law(law, -2.0), law, Target(present=0.35)))
+    # Before it runs, the block of IEC 61131-3 gives KP X0; the others' first output is theirs, of
+    # which that of ESPHome is negative where it cools.
+    factor = {"X0": float(found.get("KP", 1.0)), "starting_integral_term": -1.0}.get(name, 1.0)
+    assert factor * float(found[name]) == pytest.approx(0.35)
 
 
 def test_replay_writes_the_gains_for_the_cycle_that_the_recording_shows(tmp_path, capsys):
