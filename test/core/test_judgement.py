@@ -240,6 +240,12 @@ def test_a_process_that_changed_is_drawn_as_each_half_shows_it():
     assert not any("two halves of the record" in text for text in same.warnings)
 
 
+@pytest.mark.parametrize("dead_time", [3.063, 3.064, 3.065])
+def test_halves_that_differ_as_much_as_their_noise_are_not_told(dead_time):
+    found = in_halves(joined(PROCESS, TransferFunction.fopdt(2.0, 10.0, dead_time)))
+    assert not any("differ 1 times" in text for text in found.warnings)
+
+
 def test_gains_that_do_not_hold_on_one_half_are_doubtful(record, gains):
     found = identified(record)
     other = TransferFunction.fopdt(20.0, 10.0, 3.0)

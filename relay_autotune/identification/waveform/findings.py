@@ -122,10 +122,11 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         friction=problem.dry_friction(state.coefficients),
         to_explain=scale * _spread_beside(problem, state),
     )
-    if allowed.temper > 1.0:
+    apart = f"{math.sqrt(allowed.temper):.2g}"
+    if float(apart) > 1.0:
         told = (
-            f"two halves of the record give models that differ {math.sqrt(allowed.temper):.2g} "
-            "times as much as their noise explains: the process, its load or its operating point "
+            f"two halves of the record give models that differ {apart} times "
+            "as much as their noise explains: the process, its load or its operating point "
             "changed; intervals are widened to hold both, and gains have to hold on both"
         )
         found = replace(found, warnings=(*found.warnings, told))
