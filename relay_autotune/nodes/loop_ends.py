@@ -46,15 +46,15 @@ class CommandPublisher:
     :param node: the node.
     :param messages: writes them.
     :param topic: unresolved name of the topic.
-    :param overridable: True: parameters may change the quality of service.
+    :param options: of the publisher.
     """
 
     def __init__(
-        self, node: ServedNode, messages: CommandMessage, topic: str, *, overridable: bool = False
+        self, node: ServedNode, messages: CommandMessage, topic: str, **options: Any
     ) -> None:
         self.messages = messages
         self.publisher: Publisher = quality.publisher(
-            node, messages.kind, topic, quality.COMMAND, overridable=overridable
+            node, messages.kind, topic, quality.COMMAND, **options
         )
         self.topic: str = self.publisher.topic_name
         # Looked up once, because they are called for each measurement.
@@ -112,7 +112,10 @@ class RelayTopics:
         sends nothing but set-points."""
         # /diagnostics and the answer to a start report an incompatible QoS.
         self.command = CommandPublisher(
-            node, CommandMessage() if self.is_reported else commands, "command", overridable=True
+            node,
+            CommandMessage() if self.is_reported else commands,
+            "command",
+            **quality.OVERRIDABLE,
         )
         self.setpoint: CommandPublisher | None = None
         """Where set-points go out; None: the relay does not move them."""

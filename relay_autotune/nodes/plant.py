@@ -189,7 +189,7 @@ class PlantNode(ServedNode):
         depth = quality.MEASUREMENT.depth
         offered = quality.latched(depth) if values["on_change"] else quality.MEASUREMENT
         self._measurement = quality.publisher(
-            self, Float64, "measurement", offered, overridable=True
+            self, Float64, "measurement", offered, **quality.OVERRIDABLE
         )
         if values["feedback"]:
             self._position = quality.publisher(self, Float64, "command_feedback", quality.COMMAND)
@@ -199,7 +199,7 @@ class PlantNode(ServedNode):
             "lockstep": self._on_command_in_lockstep,
         }[values["mode"]]
         self._command = quality.subscription(
-            self, Float64, "command", received, QoSProfile(depth=1000), overridable=True
+            self, Float64, "command", received, QoSProfile(depth=1000), **quality.OVERRIDABLE
         )
         self._start = time.monotonic()
         if values["mode"] == "lockstep":

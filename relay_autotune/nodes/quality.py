@@ -41,7 +41,8 @@ def latched(depth: int) -> QoSProfile:
 
 RESULT = latched(1)
 
-_OVERRIDABLE = QoSOverridingOptions.with_default_policies()
+OVERRIDABLE = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
+"""Options of a publisher or subscription whose quality of service parameters may change."""
 
 # Topics of every node, and how many others are named where one is missing.
 _COMMON = {"/rosout", "/parameter_events"}
@@ -63,52 +64,26 @@ STATUS = QoSProfile(
 ALL_KNOWN_AFTER = 3.5
 
 
-def publisher(
-    node: Node, kind: Any, topic: str, profile: QoSProfile, *, overridable: bool = False
-) -> Any:
+def publisher(node: Node, *what: Any, **options: Any) -> Any:
     """Return a publisher without event callbacks: each costs time in every turn of the executor.
 
     :param node: that publishes.
-    :param kind: the message class.
-    :param topic: name of the topic.
-    :param profile: its quality of service.
-    :param overridable: True: parameters may change the quality of service.
+    :param what: class of the messages, topic and quality of service.
+    :param options: of `Node.create_publisher`.
     """
-    return node.create_publisher(
-        kind,
-        topic,
-        profile,
-        event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
-        qos_overriding_options=_OVERRIDABLE if overridable else None,
-    )
+    silent = PublisherEventCallbacks(use_default_callbacks=False)
+    return node.create_publisher(*what, event_callbacks=silent, **options)
 
 
-def subscription(
-    node: Node,
-    kind: Any,
-    topic: str,
-    callback: Any,
-    profile: QoSProfile,
-    *,
-    overridable: bool = False,
-) -> Any:
+def subscription(node: Node, *what: Any, **options: Any) -> Any:
     """Return a subscription without event callbacks, as :func:`publisher` has none.
 
     :param node: that subscribes.
-    :param kind: the message class.
-    :param topic: name of the topic.
-    :param callback: takes each message.
-    :param profile: its quality of service.
-    :param overridable: True: parameters may change the quality of service.
+    :param what: class of the messages, topic, what takes each of them, and quality of service.
+    :param options: of `Node.create_subscription`.
     """
-    return node.create_subscription(
-        kind,
-        topic,
-        callback,
-        profile,
-        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-        qos_overriding_options=_OVERRIDABLE if overridable else None,
-    )
+    silent = SubscriptionEventCallbacks(use_default_callbacks=False)
+    return node.create_subscription(*what, event_callbacks=silent, **options)
 
 
 def for_bag(profile: QoSProfile) -> Qos:

@@ -224,19 +224,14 @@ class Following:
     ) -> None:
         self._node, self._reader, self._take = node, reader, take
         self._favours = not node.get_parameter("use_sim_time").value
-        self.subscription = self._subscribed(quality.MEASUREMENT, overridable=True)
+        self.subscription = self._subscribed(quality.MEASUREMENT, **quality.OVERRIDABLE)
         """The subscription in force."""
         given = f"qos_overrides.{self.subscription.topic_name}.subscription.reliability"
         self._is_given = given in node._parameter_overrides
 
-    def _subscribed(self, profile: QoSProfile, *, overridable: bool = False) -> Subscription:
+    def _subscribed(self, profile: QoSProfile, **options: Any) -> Subscription:
         found: Subscription = quality.subscription(
-            self._node,
-            self._reader.kind,
-            "measurement",
-            self._take,
-            profile,
-            overridable=overridable,
+            self._node, self._reader.kind, "measurement", self._take, profile, **options
         )
         if self._favours:
             self._node.favour(found)
