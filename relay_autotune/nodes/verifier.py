@@ -9,8 +9,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from enum import Enum, auto
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -131,13 +130,42 @@ class Rest:
     noise_std: float
 
 
-class _Phase(Enum):
-    IDLE = auto()
-    PREPARING = auto()
-    SETTLING = auto()
-    STEPPING = auto()
-    RETURNING = auto()
-    ENDING = auto()
+@dataclass(eq=False)
+class Trial:
+    """A step that is being made.
+
+    :param number: of the step, from 1 on.
+    :param of: number of steps.
+    :param step: the step.
+    :param plan: for it.
+    :param rest: of the loop before it.
+    :param hole: longest gap in the samples [s].
+    """
+
+    number: int
+    of: int
+    step: Step
+    plan: Plan
+    rest: Rest
+    hole: float
+    samples: list[_Sample] = field(default_factory=list)
+    """With the step, then back without it."""
+    made: tuple[_Sample, ...] = ()
+    """All samples with the step, once it is taken back."""
+
+    @property
+    def lasted(self) -> float:
+        """Time of the samples [s]."""
+        return self.samples[-1][0] - self.samples[0][0] if self.samples else 0.0
+
+    @property
+    def is_over(self) -> bool:
+        """True once there are samples for the whole time."""
+        return bool(self.samples) and self.lasted >= self.plan.duration
+
+
+class _EndedError(Exception):
+    """The proof has ended before its course did."""
 
 
 class Verifier:
@@ -165,28 +193,21 @@ class Verifier:
         ended: Callable[[bool | None, str], Awaitable[str]],
     ) -> None:
         self._node = node
-        self._verifiable = prepare
-        self._on_trial = begin
-        self._move = move
-        self._ended = ended
-        self._phase = _Phase.IDLE
-        # What ends the proof: verdict, reason, and whether the action succeeded.
-        self._outcome: Future = Future()
-        # Done at the next look.
-        self._next_look: Future = Future()
+        self._verifiable, self._on_trial, self._move, self._ended = prepare, begin, move, ended
+        # Verdict and reason, once the proof has ended.
+        self._over: tuple[bool | None, Reason] | None = None
+        # Done at the next look, at the end of a step, and at that of the proof.
+        self._wake: Future = Future()
         self._waits_for = ""
         self._recent: deque[_Sample] = deque(maxlen=_BEFORE)
         self._arrivals: deque[float] = deque(maxlen=_BEFORE)
-        self._tried: Verifiable
-        self._plans: list[Plan] = []
+        self._is_settling = False
+        self._trial: Trial | None = None
         self._found: list[Any] = []
-        self._number = 0
-        self._samples: list[_Sample] = []
-        self._rest: Rest
-        self._begun = 0.0
+        # When the first step began, and how long all of them take, both ways [s].
+        self._begun = self._planned = 0.0
         # On the steady clock: the deadline, and the last advance of the samples' time.
         self._until = self._advanced = 0.0
-        self._period = 0.0
         self._beyond = 0
         self._watch = node.create_timer(_LOOK_EVERY, self._look, clock=STEADY, autostart=False)
         self._narrator = Narrator(node, self._words, self._tell)
@@ -205,8 +226,7 @@ class Verifier:
     @property
     def rested_at(self) -> float:
         """Command at rest before the present step [u]; NaN without a step."""
-        moved = self._phase in (_Phase.STEPPING, _Phase.RETURNING)
-        return self._rest.command if moved else math.nan
+        return math.nan if self._trial is None else self._trial.rest.command
 
     # Beginning.
 
@@ -227,8 +247,8 @@ class Verifier:
         if why:
             conclude(goal, _result(False, why, str(why)), succeeded=False)
             return
-        self._action.running, self._phase, self._found = goal, _Phase.PREPARING, []
-        self._outcome, self._waits_for = Future(), ""
+        self._action.running, self._over, self._found = goal, None, []
+        self._waits_for, self._is_settling = "", False
         self._until = time.monotonic() + _PREPARED_WITHIN + patience
         self._watch.reset()
         self._node.defer(self._narrator.now)
@@ -236,78 +256,121 @@ class Verifier:
 
     async def _prove(self, goal: Any) -> None:
         """Make a proof from its begin to its end; there is no other way out of it."""
+        succeeded = True
         try:
-            await self._begin(goal.request)
+            self._end(*await self._course(goal.request))
         except Exception as error:  # noqa: BLE001  the loop goes on, and the client is told
-            self._end(None, _why(error), succeeded=False)
-        passed, why, succeeded = await self._outcome
+            succeeded = self._over is not None
+            self._end(None, _why(error))
+        assert self._over is not None
+        passed, why = self._over
         reason = str(why)
         try:
             reason = await self._ended(passed, reason)
         except Exception as error:  # noqa: BLE001
             reason = f"{reason}; {_why(error)}"
         self._watch.cancel()
-        self._action.running, self._phase = None, _Phase.IDLE
+        self._action.running = None
         steps = [without_arrays(message) for message in self._found]
         result = _result(passed is True, why, reason, steps)
         self._found = []
         conclude(goal, result, succeeded=succeeded)
 
-    async def _begin(self, request: Any) -> None:
-        """Put the gains on trial and begin the first step, unless the proof has ended before."""
+    async def _course(self, request: Any) -> tuple[bool | None, Reason]:
+        """Put the gains on trial, make the steps, and return verdict and reason."""
         tried = await self._verifiable(request)
-        until = time.monotonic() + request.patience
-        if tried.new is not None and self._is_preparing():
+        self._require_on()
+        if tried.new is not None:
             await self._on_trial(tried)
-            if self._is_preparing():
-                shown = self._recent[-1][0] - self._recent[0][0]
-                await self._settled(tried.settles if math.isfinite(tried.settles) else shown)
-                until = time.monotonic() + request.patience
-        rest, period = await self._rested(tried.steps, until)
-        if not self._is_preparing():
-            return
-        loop = tried.control, tried.model
-        plans = await self._node.computed(
-            lambda: [plan(*loop, s, period, rest.noise_std) for s in tried.steps]
-        )
+            self._require_on()
+            shown = self._recent[-1][0] - self._recent[0][0]
+            await self._settled(tried.settles if math.isfinite(tried.settles) else shown)
+        rest, period = await self._rested(tried.steps, time.monotonic() + request.patience)
+        loop, noise = (tried.control, tried.model), rest.noise_std
+        plans = await self._computed(lambda: [plan(*loop, s, period, noise) for s in tried.steps])
         for step, planned in zip(tried.steps, plans, strict=True):
-            planned.require_visible(step, rest.noise_std)
-        if tried.new is None and self._is_preparing():
+            planned.require_visible(step, noise)
+        if tried.new is None:
             await self._on_trial(tried)
-        if not self._is_preparing():
-            return
-        self._tried, self._rest, self._period = tried, rest, period
-        self._plans, self._number, self._beyond = plans, 0, 0
-        self._begun = self._recent[-1][0]
-        planned_time = 2.0 * sum(p.duration for p in plans)
+            self._require_on()
+        self._begun, self._beyond = self._recent[-1][0], 0
+        self._planned = 2.0 * sum(p.duration for p in plans)
         self._until = (
-            time.monotonic() + _TIMES_PLANNED * self._pace() * planned_time + _MORE_THAN_PLANNED
+            time.monotonic() + _TIMES_PLANNED * self._pace() * self._planned + _MORE_THAN_PLANNED
         )
-        self._begin_step()
+        whys: list[Reason] = []
+        for number, (step, planned) in enumerate(zip(tried.steps, plans, strict=True), 1):
+            hole = max(_SILENT_INTERVALS * period, _LARGEST_HOLE * planned.duration)
+            self._trial = trial = Trial(number, len(plans), step, planned, rest, hole)
+            self._move(step.setpoint, step.load)
+            self._node.defer(self._narrator.now)
+            while not trial.made:
+                await self._woken()
+            try:
+                message = await self._computed(partial(judged, tried, trial))
+            except _EndedError:
+                raise
+            except Exception as error:  # noqa: BLE001  the client is told
+                return None, Code.NOT_JUDGED(why=str(_why(error)))
+            self._found.append(message)
+            self._full.publish(message)
+            whys.append(reason_from_message(message.why, message.reason))
+            if not message.passed:
+                return False, whys[-1]
+            if number == len(plans):
+                break
+            while not trial.is_over:
+                await self._woken()
+            _, y, u = np.transpose(trial.samples[-_BEFORE:])
+            rest = replace(rest, measurement=float(y.mean()), command=float(u.mean()))
+        worst = max(whys, key=lambda why: why.code)
+        return True, replace(worst, said="; ".join(map(str, whys)))
 
-    def _is_preparing(self) -> bool:
-        return self._phase is _Phase.PREPARING
+    def _require_on(self) -> None:
+        if self._over is not None:
+            raise _EndedError
+
+    async def _woken(self) -> None:
+        """Wait until something may have come; raise _EndedError if the proof has ended."""
+        self._wake = Future()
+        await self._wake
+        self._require_on()
+
+    def _wake_up(self) -> None:
+        if not self._wake.done():
+            self._wake.set_result(None)
+
+    async def _computed(self, work: Callable[[], Any]) -> Any:
+        """Return what ``work`` returns in a thread, or raise what it raises; the loop goes on."""
+        found: list[Any] = []
+
+        def taken(result: Any) -> None:
+            found.append(result)
+            self._wake_up()
+
+        self._node.compute(work, taken)
+        while not found:
+            await self._woken()
+        if isinstance(found[0], Exception):
+            raise found[0]
+        return found[0]
 
     async def _settled(self, seconds: float) -> None:
-        """Wait until the loop has run for a time with its new gains, or the proof has ended.
+        """Wait until the loop has run for a time with its new gains.
 
         :param seconds: by the time of the samples [s].
         """
-        self._phase = _Phase.SETTLING
+        self._is_settling = True
         self._until += _TIMES_PLANNED * self._pace() * seconds + _MORE_THAN_PLANNED
         begun, self._advanced = self._recent[-1][0], time.monotonic()
         # The first sample with the new gains aligns them without a bump: a step before it would be
         # taken for part of that.
-        while (
-            self._phase is _Phase.SETTLING
-            and not 0.0 < (done := self._recent[-1][0] - begun) >= seconds
-        ):
+        while not 0.0 < (done := self._recent[-1][0] - begun) >= seconds:
             self._waits_for = (
                 f"the loop settles with the new gains, {duration(done)} of {duration(seconds)}"
             )
-            await self._look_again()
-        if self._phase is _Phase.SETTLING:
-            self._phase = _Phase.PREPARING
+            await self._woken()
+        self._is_settling = False
 
     async def _rested(self, steps: Sequence[Step], until: float) -> tuple[Rest, float]:
         """Return the loop's state of rest and its sample period [s], as soon as it is at rest.
@@ -321,17 +384,13 @@ class Verifier:
                 self.require_samples()
                 found = self._at_rest(steps)
             except NotReadyError as error:
-                if self._phase is not _Phase.PREPARING or time.monotonic() >= until:
+                if time.monotonic() >= until:
                     raise
                 self._waits_for = str(error)
             else:
                 self._waits_for = ""
                 return found
-            await self._look_again()
-
-    async def _look_again(self) -> None:
-        self._next_look = Future()
-        await self._next_look
+            await self._woken()
 
     def _pace(self) -> float:
         """Return the steady time for one second of the samples' time."""
@@ -353,12 +412,6 @@ class Verifier:
             raise NotReadyError(Code.NOT_AT_REST(drift=drift, samples=len(self._recent)))
         return Rest(float(y.mean()), float(u.mean()), noise), period
 
-    def _begin_step(self) -> None:
-        self._phase, self._samples = _Phase.STEPPING, []
-        step = self._tried.steps[self._number]
-        self._move(step.setpoint, step.load)
-        self._node.defer(self._narrator.now)
-
     # While it runs.
 
     def sample(self, at: float, measurement: float, command: float) -> None:
@@ -379,109 +432,58 @@ class Verifier:
         sample = (at, measurement, command)
         self._recent.append(sample)
         self._arrivals.append(now)
-        if self._phase not in (_Phase.STEPPING, _Phase.RETURNING):
+        if (trial := self._trial) is None:
             self._beyond = 0
-            return
-        wanted = self._plans[self._number]
-        hole = max(_SILENT_INTERVALS * self._period, _LARGEST_HOLE * wanted.duration)
-        if since < 0.0:
+        elif since < 0.0:
             self.interrupt(Code.STEP_TIME_BACKWARDS(by=-since))
-            return
-        if since > hole:
+        elif since > trial.hole:
             self.interrupt(Code.STEP_GAP(by=since))
-            return
-        self._samples.append(sample)
-        over = at - self._samples[0][0] >= wanted.duration
-        if self._phase is _Phase.RETURNING:
-            # Go on only when the judgement of the last step has also arrived.
-            if over and len(self._found) > self._number:
-                self._go_on()
-            return
-        away = abs(measurement - self._rest.measurement)
-        self._beyond = self._beyond + 1 if away > wanted.runaway else 0
-        if self._beyond >= _IN_A_ROW:
-            self._end(False, Code.STEP_RAN_AWAY(away=away, most=wanted.runaway))
-        elif over:
-            self._return()
+        else:
+            trial.samples.append(sample)
+            if not trial.made:
+                away = abs(measurement - trial.rest.measurement)
+                self._beyond = self._beyond + 1 if away > trial.plan.runaway else 0
+                if self._beyond >= _IN_A_ROW:
+                    self._end(False, Code.STEP_RAN_AWAY(away=away, most=trial.plan.runaway))
+                elif trial.is_over:
+                    trial.made, trial.samples = tuple(trial.samples), []
+                    self._move(0.0, 0.0)
+                    self._wake_up()
+            elif trial.is_over:
+                self._wake_up()
 
     def out_of_range(self, measurement: float) -> None:
         """Take a measurement outside its range [y], which the controller did not answer."""
         self._beyond += 1
-        tried = self._phase in (_Phase.SETTLING, _Phase.STEPPING)
+        tried = self._is_settling or (self._trial is not None and not self._trial.made)
         if tried and self._beyond >= _IN_A_ROW:
             self._end(False, Code.STEP_OUT_OF_RANGE(value=measurement))
 
-    def _return(self) -> None:
-        """Remove the step, and judge it meanwhile."""
-        judge = partial(
-            judged,
-            self._tried,
-            self._tried.steps[self._number],
-            self._plans[self._number],
-            tuple(self._samples),
-            self._rest,
-        )
-        self._node.compute(judge, partial(self._judged, self._action.running))
-        self._phase, self._samples = _Phase.RETURNING, []
-        self._move(0.0, 0.0)
-
-    def _judged(self, goal: Any, message: Any) -> None:
-        if goal is not self._action.running or self._phase is not _Phase.RETURNING:
-            return
-        if isinstance(message, Exception):
-            self.interrupt(Code.NOT_JUDGED(why=str(_why(message))))
-            return
-        self._found.append(message)
-        self._full.publish(message)
-        whys = [reason_from_message(m.why, m.reason) for m in self._found]
-        if not message.passed:
-            self._end(False, whys[-1])
-        elif len(self._found) == len(self._tried.steps):
-            said = "; ".join(map(str, whys))
-            worst = max(whys, key=lambda why: why.code)
-            self._end(True, replace(worst, said=said))
-
-    def _go_on(self) -> None:
-        last = self._samples[-_BEFORE:]
-        self._rest = Rest(
-            float(np.mean([y for _, y, _ in last])),
-            float(np.mean([u for _, _, u in last])),
-            self._rest.noise_std,
-        )
-        self._number += 1
-        self._begin_step()
-
     def _words(self) -> str:
         """Say what the verification waits for and sees; empty where none runs."""
-        if self._phase in (_Phase.PREPARING, _Phase.SETTLING):
-            return self._waits_for or "computing what the step will do"
-        if self._phase not in (_Phase.STEPPING, _Phase.RETURNING):
+        if self._action.running is None or self._over is not None:
             return ""
-        samples, wanted = self._samples, self._plans[self._number]
-        done = duration(samples[-1][0] - samples[0][0] if samples else 0.0)
+        if (trial := self._trial) is None:
+            return self._waits_for or "computing what the step will do"
         now = (
-            f"{done} of {duration(wanted.duration)}: the measurement is {self._recent[-1][1]:.6g}"
+            f"{duration(trial.lasted)} of {duration(trial.plan.duration)}: the measurement is "
+            f"{self._recent[-1][1]:.6g}"
         )
-        step = self._tried.steps[self._number]
-        if self._phase is _Phase.RETURNING:
+        if trial.made:
             return f"back without the step, {now}"
+        step = trial.step
         what = f"set-point {step.setpoint:+g} y" if step.setpoint else f"load {step.load:+g} u"
-        return f"step {self._number + 1} of {len(self._tried.steps)}, {what}, {now}"
+        return f"step {trial.number} of {trial.of}, {what}, {now}"
 
     def _tell(self, status: str) -> None:
         if self._action.running is None:
             return
-        planned = self._phase in (_Phase.STEPPING, _Phase.RETURNING)
-        elapsed = self._recent[-1][0] - self._begun if planned else 0.0
-        whole = 2.0 * sum(p.duration for p in self._plans) if planned else 0.0
-        self._action.running.publish_feedback(
-            Verify.Feedback(
-                step=self._number + 1 if planned else 1,
-                elapsed=elapsed,
-                remaining=max(whole - elapsed, 0.0),
-                status=status,
-            )
-        )
+        feedback = Verify.Feedback(step=1, status=status)
+        if (trial := self._trial) is not None:
+            feedback.step = trial.number
+            feedback.elapsed = self._recent[-1][0] - self._begun
+            feedback.remaining = max(self._planned - feedback.elapsed, 0.0)
+        self._action.running.publish_feedback(feedback)
 
     # Ending.
 
@@ -490,15 +492,14 @@ class Verifier:
         self._end(None, why)
 
     def _look(self) -> None:
-        if not self._next_look.done():
-            self._next_look.set_result(None)
+        self._wake_up()
         now = time.monotonic()
         if now > self._until:
             self.interrupt(Code.STEP_OVERTIME())
             return
-        if self._phase is _Phase.PREPARING or not self._arrivals:
-            return
         arrivals = self._arrivals
+        if (self._trial is None and not self._is_settling) or not arrivals:
+            return
         usual = (arrivals[-1] - arrivals[0]) / max(len(arrivals) - 1, 1)
         patience = max(_SILENCE, _SILENT_INTERVALS * usual)
         if now - arrivals[-1] > patience:
@@ -506,34 +507,32 @@ class Verifier:
         elif now - self._advanced > patience:
             self.interrupt(Code.STEP_TIME_STANDS())
 
-    def _end(self, passed: bool | None, why: Reason, *, succeeded: bool = True) -> None:
-        if self._phase in (_Phase.IDLE, _Phase.ENDING):
+    def _end(self, passed: bool | None, why: Reason) -> None:
+        """End the proof, unless it has ended or none runs."""
+        if self._action.running is None or self._over is not None:
             return
-        if self._phase in (_Phase.STEPPING, _Phase.RETURNING):
+        self._over = passed, why
+        if self._trial is not None:
+            self._trial = None
             self._move(0.0, 0.0)
-        self._phase = _Phase.ENDING
         # As a task, so that the executor wakes.
-        self._node.executor.create_task(self._outcome.set_result, (passed, why, succeeded))
+        self._node.executor.create_task(self._wake_up)
 
 
-def judged(
-    tried: Verifiable, step: Step, planned: Plan, samples: tuple[_Sample, ...], rest: Rest
-) -> Any:
+def judged(tried: Verifiable, trial: Trial) -> Any:
     """Compare a step with its prediction and return the `Verification` message.
 
     :param tried: gains, model and limits.
-    :param step: the step.
-    :param planned: for it.
-    :param samples: time [s], measurement [y] and command [u] of each, the first at the step.
-    :param rest: where the loop was before it.
+    :param trial: the step that was made.
     :raises RelayAutotuneError: if the measurement is too coarse to judge it.
     """
-    t, y, u = (np.array(column) for column in zip(*samples, strict=True))
+    step, rest = trial.step, trial.rest
+    t, y, u = np.transpose(trial.made)
     levels = np.unique(y)
     if levels.size < 2:
         raise NotReadyError("the measurement did not change at all")
     # A loop at rest does not show how coarse its sensor is; rounding is noise, too.
-    planned.require_visible(step, float(np.diff(levels).min()) / math.sqrt(12.0))
+    trial.plan.require_visible(step, float(np.diff(levels).min()) / math.sqrt(12.0))
     limits = tried.limits
     found = compare(
         tried.control,

@@ -22,7 +22,7 @@ from relay_autotune.loop.laws import LAWS
 from relay_autotune.loop.sampled import UNLIMITED
 from relay_autotune.nodes.gains_place import RemoteGains, mapping_of
 from relay_autotune.nodes.results import keep
-from relay_autotune.nodes.verifier import Predictors, Rest, Verifiable, judged
+from relay_autotune.nodes.verifier import Predictors, Rest, Trial, Verifiable, judged
 from relay_autotune.process.transfer_function import TransferFunction
 
 GOOD, WILD, BY_HAND = (GainSet.of({"kc": kc, "ti": 0.3}) for kc in (0.5, 0.9, 0.7))
@@ -86,7 +86,7 @@ def test_a_sensor_that_is_too_coarse_for_a_step_gives_no_verdict() -> None:
     def seen(resolution: float) -> Any:
         y = np.round(exact / resolution) * resolution
         samples = tuple(zip(time, y, np.ones(time.size), strict=True))
-        return judged(tried, step, planned, samples, rest)
+        return judged(tried, Trial(1, 1, step, planned, rest, math.inf, made=samples))
 
     assert seen(1e-4).passed
     with pytest.raises(TuningError, match="cannot be judged"):
