@@ -9,6 +9,7 @@ What the file does not tell is guessed, and each guess is a note.
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -41,8 +42,14 @@ _UNITS = {
     "us": 1e3, "usec": 1e3, "\u00b5s": 1e3, "\u03bcs": 1e3, "micros": 1e3, "microseconds": 1e3,
     "ns": 1.0, "nanoseconds": 1.0,
     "min": 6e10, "mins": 6e10, "minutes": 6e10, "h": 3.6e12, "hours": 3.6e12,
+    "d": 8.64e13, "day": 8.64e13, "days": 8.64e13,
 }  # fmt: skip
 _UNIT = re.compile(r"\s*[\[(]\s*(?P<unit>[^\])]*?)\s*[\])]\s*$")
+# Days since 1899-12-30, as spreadsheets count them: those of 1970-01-01, those of a date from 1954
+# to 2119, and the longest mean step from row to row where nothing says that they are days: as
+# seconds, a faster logger than one of 1 kHz.
+_DAYS_OF_1970, _SERIAL, _SERIAL_STEP = 25569.0, (20_000.0, 80_000.0), 9e-4
+_DAYS = frozenset(("date", "datetime", "datum", "fecha"))
 # Words in the names of columns.
 _TIMES = frozenset(
     ("time", "timestamp", "stamp", "date", "datetime", "clock", "elapsed", "millis", "micros",
@@ -269,7 +276,15 @@ def _nanoseconds(
     step = float(np.median(np.abs(np.diff(time))))
     unit = given or _unit_of(name)
     scale = _UNITS.get(unit.lower()) if unit else None
-    if scale is not None and scale != 1e9:
+    in_days = scale == _UNITS["d"] or (scale is None and bool(_words(name) & _DAYS))
+    if (scale is None or in_days) and _is_serial(time, math.inf if in_days else _SERIAL_STEP):
+        notes.append(
+            f"the column {name!r} is taken as days since 1899-12-30, as spreadsheets count dates; "
+            "--time-unit names another unit"
+        )
+        time, scale = (time - _DAYS_OF_1970) * 86400.0, 1e9
+        largest = float(np.abs(time).max())
+    elif scale is not None and scale != 1e9:
         said = "" if given else f", as {name!r} says"
         notes.append(f"the time is taken in {unit}{said}")
     elif scale is None and largest > _DATES[0][0]:
@@ -299,6 +314,15 @@ def _nanoseconds(
     whole = np.floor(time)
     ns = whole.astype(np.int64) * int(scale) + np.round((time - whole) * scale).astype(np.int64)
     return ns, bool(ns[0] > EPOCH * 1e9)
+
+
+def _is_serial(time: FloatArray, longest: float) -> bool:
+    """Return whether times are the dates of a spreadsheet.
+
+    :param longest: mean step from row to row that they may have at most.
+    """
+    (low, high), first, last = _SERIAL, float(time.min()), float(time.max())
+    return low <= first <= last <= high and last - first < longest * (time.size - 1)
 
 
 def _unwrapped(time: FloatArray, name: str, notes: list[str]) -> FloatArray:

@@ -53,7 +53,7 @@ class Column(Generic[T]):
 # Which time of a message counts; the first is the default.
 CLOCKS = ("publish", "log", "header")
 # Units of the times in a file of text.
-TIME_UNITS = ("s", "ms", "us", "min", "h")
+TIME_UNITS = ("s", "ms", "us", "min", "h", "d")
 
 
 def flags_of(measurement: str, command: str) -> str:

@@ -204,6 +204,7 @@ def stamped(form):
         ("t", lambda t: f"{1.79e15 + 1e6 * t:.0f}", "'t' is taken as microseconds", 1.79e9),
         ("time_ms", lambda t: f"{1e3 * t:g}", "the time is taken in ms, as 'time_ms' says", 0.0),
         ("micros", lambda t: f"{1e6 * t:.0f}", "the time is taken in micros, as", 0.0),
+        ("t (d)", lambda t: f"{t / 86400:.15f}", "the time is taken in d", 0.0),
         (
             "t",
             lambda t: f"23:59:{55 + t:06.3f}" if t < 5.0 else f"0:00:{t - 5.0:06.3f}",
@@ -222,6 +223,29 @@ def test_times_in_other_units_and_dates(tmp_path, header, form, said, start):
     record = same_as_plain(tmp_path, found)
     assert said in found.notes[0]
     assert record.start == (1789998400.0 if start is None else start)
+
+
+@pytest.mark.parametrize("header", ["Date", "Time", "t (d)"])
+def test_the_dates_of_a_spreadsheet_are_days(tmp_path, header):
+    """Of 2026-09-21, in cells that are shown as numbers."""
+    text = f"{header},y,u\n" + stamped(lambda t: f"{serial(t):.11f}")
+    found = read_experiments(write(tmp_path / "a.csv", text))
+    assert "is taken as days since 1899-12-30" in found.notes[0]
+    (record,) = found.experiments
+    assert record.start == pytest.approx(1789998400.0, abs=1e-5)
+    np.testing.assert_allclose(record.time, 0.5 * np.arange(20), atol=1e-5)
+
+
+def serial(seconds):
+    """Return a time on 2026-09-21 in the days of a spreadsheet."""
+    at = datetime(2026, 9, 21, 13, 46, 40) + timedelta(seconds=seconds)
+    return (at - datetime(1899, 12, 30)) / timedelta(days=1)
+
+
+def test_the_uptime_of_a_fast_logger_is_no_date(tmp_path):
+    rows = "\n".join(f"{25_200 + 0.001 * k:.3f},{k % 7},{k // 9 % 2}" for k in range(40))
+    found = read_experiments(write(tmp_path / "a.csv", f"time,y,u\n{rows}"), Selection(end=1.0))
+    assert found.experiments[0].duration == pytest.approx(0.039)
 
 
 def test_a_unit_in_a_header_need_not_be_typed(tmp_path):
