@@ -5,11 +5,13 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from relay_autotune.bag.bag_file import BagFile, McapFile
 from relay_autotune.bag.limits import LARGEST_CHUNK
@@ -19,6 +21,9 @@ from relay_autotune.bag.topics import Progress, Topics
 from relay_autotune.errors import BagError, RelayAutotuneError
 
 _STORED = (".mcap", ".db3")
+_TEXTS = (".csv", ".txt", ".dat", ".tsv", ".log")
+# What can be read, in words.
+READABLE = f"{', '.join(_STORED)}, or a table of numbers in {', '.join(_TEXTS)}"
 # A file compressed as a whole, as rosbag2 and the zstd command name it.
 _WHOLE = tuple([kind, end] for kind in _STORED for end in (".zstd", ".zst"))
 
@@ -109,18 +114,29 @@ def may_be_recording(path: Path) -> bool:
         names = {entry.name for entry in path.iterdir()} if os.access(path, os.R_OK) else set()
         # A bag that lost its files still has its description.
         return "metadata.yaml" in names or not names or any(map(_named_so, map(Path, names)))
-    if not path.exists() or _named_so(path) or path.suffix.lower() == ".csv":
+    if not path.exists() or _named_so(path) or path.suffix.lower() == _TEXTS[0]:
         return True
     try:
         with open_regular(path) as file:
-            return known_start(file.read(32))
+            return _has_table(path, file) if is_text(path) else known_start(file.read(32))
     except RelayAutotuneError:
         return True
 
 
 def is_text(path: Path) -> bool:
     """Return whether a path is called like a text with columns."""
-    return path.suffix.lower() in (".csv", ".txt", ".dat", ".tsv", ".log")
+    return path.suffix.lower() in _TEXTS
+
+
+def _has_table(path: Path, file: BinaryIO) -> bool:
+    """Return whether a text has rows of numbers: many are notes, or logs of what happened."""
+    # Imported here: it is not needed for a bag.
+    from relay_autotune.bag.text_table import TextTable
+
+    try:
+        return TextTable(path, file).is_sure
+    except (BagError, UnicodeError, csv.Error):
+        return False
 
 
 def _named_so(path: Path) -> bool:

@@ -107,6 +107,12 @@ class TextTable:
         self._day = self._day_before_its_time()
         self.names = self._joined(self.names)
 
+    @property
+    def is_sure(self) -> bool:
+        """True if rows of numbers follow each other; one may be a sentence with numbers in it."""
+        first = [cells for _, cells in self._waiting[:2]]
+        return len(first) == 2 and _are_data(*first)
+
     def _encoding(self, first: bytes) -> str:
         if first[:2] in (b"\xff\xfe", b"\xfe\xff"):
             return "utf-16"

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from relay_autotune.bag.reader import may_be_recording, recordings_in
+from relay_autotune.bag.reader import READABLE, may_be_recording, recordings_in
 from relay_autotune.cli.arguments import (
     DONE,
     DOUBTFUL,
@@ -215,7 +215,7 @@ def _recordings(given: Sequence[str]) -> list[str]:
         # The error of each then says what it is.
         return list(given)
     for name in left_out:
-        say(PROGRAM, f"{name} is left out: it is not a recording (.mcap, .db3 or .csv)")
+        say(PROGRAM, f"{name} is left out: it is not a recording ({READABLE})")
     return found
 
 

@@ -59,6 +59,7 @@ def test_a_folder_of_bags_is_a_table_with_a_line_each(tmp_path, capsys, more):
     links(tmp_path, 2)
     (tmp_path / "broken.mcap").write_bytes(b"junk")
     (tmp_path / "notes.txt").write_text("to be passed over")
+    (tmp_path / "launch.log").write_text("1790000000.1 [INFO] started\n1790000000.2 [INFO] done\n")
     names = [f"a column called {k}" for k in "abcd"]
     (tmp_path / "unclear.csv").write_text(",".join(names) + "\n1,2,3,4\n2,3,4,5\n")
     status, out, err = run(capsys, "--rule", "imc", *more, tmp_path)
@@ -101,6 +102,21 @@ def test_a_folder_that_is_one_recording_is_told_from_a_folder_of_them(tmp_path, 
     for name in files:
         (tmp_path / name).touch()
     assert len(recordings_in(tmp_path)) == count
+
+
+@pytest.mark.parametrize("ending", [".csv", ".txt", ".dat", ".tsv", ".log", ".TXT"])
+def test_every_table_that_is_read_alone_is_read_in_a_folder(tmp_path, capsys, ending):
+    for name in ("a", "b"):
+        (tmp_path / f"{name}{ending}").write_text("t,y,u\n0,1,0\n1,1,1\n2,2,1\n")
+    (tmp_path / "notes.txt").write_text("The oven of 2026.\n12 runs, 3 of them good.\n")
+    found = [path.name for path in recordings_in(tmp_path)]
+    assert found == [f"a{ending}", f"b{ending}"]
+    _, out, err = run(capsys, "--json", *sorted(tmp_path.iterdir()))
+    assert [json.loads(line)["bag"] for line in out.splitlines()] == [
+        str(tmp_path / name) for name in found
+    ]
+    (left_out,) = [line for line in err.splitlines() if "is left out" in line]
+    assert "notes.txt is left out" in left_out and ".tsv" in left_out
 
 
 def test_processes_do_each_bag_once(tmp_path):
