@@ -256,11 +256,22 @@ class _Tuning:
     def design_task(self, found: Analysis) -> DesignTask:
         """Return what the rules are given for the selected model of an analysis."""
         chosen = found.models[0]
+        options = _with_noise(self.task.options, found)
+        models = ensemble(chosen, rng=self.rng or np.random.default_rng(0))
+        unseen = _unseen(found.record, self.task.options)
+        if unseen:
+            options = replace(options, loop_delay=options.loop_delay + 0.5 * unseen)
+            spread = unseen * ((np.arange(len(models)) + 0.5) / max(len(models), 1) - 0.5)
+            turned = (self.rng or np.random.default_rng(0)).permutation(spread)
+            models = tuple(
+                replace(m, dead_time=max(m.dead_time + float(late), 0.0))
+                for m, late in zip(models, turned, strict=True)
+            )
         return DesignTask(
             model=chosen.model,
-            options=_with_noise(self.task.options, found),
+            options=options,
             simple=self.simple,
-            models=ensemble(chosen, rng=self.rng or np.random.default_rng(0)),
+            models=models,
             describing=_describing_point(found),
         )
 
@@ -370,6 +381,16 @@ def _judged(
         return _without_gains(found, judgement)
     tuning.tell("designing the gains")
     shaping = Shaping(tuning.design_task(found), evidence, findings)
+    unseen = _unseen(found.record, tuning.task.options)
+    if unseen:
+        told = (
+            f"a change of the command may have come up to {digits(unseen, 3)} s before its row, "
+            f"since the controller is to run more often than these were written: the gains allow "
+            f"for as much more dead time; log faster, or add a row at each change"
+        )
+        chosen = found.models[0]
+        chosen = replace(chosen, warnings=(*chosen.warnings, told))
+        found = replace(found, models=(chosen, *found.models[1:]))
     found = replace(found, shaping=shaping)
     tuned = _tuned(found, shaping.task, tuning.rules)
     gains = tuned.best_gains
@@ -448,6 +469,18 @@ def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
         # Further digits are jitter of the stamps, and no program is set to them.
         options = replace(options, sample_period=float(f"{_sampling_period(record):.3g}"))
     return options
+
+
+def _unseen(record: Record, options: DesignOptions) -> float:
+    """Return how long before its row a change of the command may have come [s]; 0: not at all.
+
+    A controller that runs more often than the rows of a table is not the one that wrote them: it
+    moved the command anywhere between two of them, and what the model takes for its dead time is
+    too short by up to the time between them.
+    """
+    if not (record.is_table and options.sample_period > 0.0):
+        return 0.0
+    return max(_sampling_period(record) - options.sample_period, 0.0)
 
 
 def _sampling_period(record: Record) -> float:

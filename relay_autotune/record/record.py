@@ -423,6 +423,12 @@ class Record:
         return self.duration / max(len(self) - 1, 1)
 
     @property
+    def is_table(self) -> bool:
+        """True if the command is known at the samples only, as in a table of rows."""
+        own = self.settings is None and self.held_input is None and not self.continuous_command
+        return own and bool(np.array_equal(self.command_time, self.time))
+
+    @property
     @cached_on_record
     def noise(self) -> float:
         """The noise measured before the test, or else estimated from second differences [y]."""

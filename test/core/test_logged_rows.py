@@ -1,0 +1,52 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""A table that a logger wrote: the command changed at some instant between two rows."""
+
+import numpy as np
+import pytest
+
+from relay_autotune import DesignOptions, Record, analyse
+
+_GAIN, _LAGS, _DEAD_TIME = 1.1, (170.0, 38.0), 32.0
+
+
+def _step_response(time: np.ndarray) -> np.ndarray:
+    slow, fast = _LAGS
+    t = np.maximum(time - _DEAD_TIME, 0.0)
+    rest = (slow * np.exp(-t / slow) - fast * np.exp(-t / fast)) / (slow - fast)
+    return _GAIN * (1.0 - rest)
+
+
+def _logged(interval: float, instants: tuple[float, ...]) -> Record:
+    time = np.arange(0.0, 5400.0, interval)
+    noise = np.random.default_rng(0).normal(0.0, 0.05, time.size)
+    moves = list(zip(instants, (5.0, -10.0, 5.0), strict=True))
+    y = sum(size * _step_response(time - instant) for instant, size in moves) + noise
+    u = sum(size * (time >= instant) for instant, size in moves)
+    return Record(time=time, measurement=y, command=u)
+
+
+def _true_ms(gains) -> float:
+    s = 1j * np.geomspace(1e-4, 1.0, 4000)
+    process = _GAIN * np.exp(-s * _DEAD_TIME) / np.prod([1.0 + tau * s for tau in _LAGS], axis=0)
+    controller = gains.kc * (1.0 + 1.0 / (gains.ti * s) + gains.td * s) / (1.0 + gains.tf * s)
+    return float(np.max(1.0 / np.abs(1.0 + process * controller)))
+
+
+# Up to three quarters of an interval before the row that shows the change.
+@pytest.mark.parametrize(
+    ("interval", "instants"),
+    [(30.0, (609.0, 2240.0, 3906.0)), (60.0, (615.0, 2240.0, 3920.0))],
+)
+def test_a_faster_controller_gets_gains_that_hold_whenever_the_command_changed(interval, instants):
+    asked = DesignOptions(sample_period=1.0)
+    found = analyse(_logged(interval, instants), rule="robust", options=asked)
+    assert _true_ms(found.best_gains) < 1.5
+    assert any("before its row" in warning for warning in found.model.warnings)
+
+
+def test_the_controller_that_wrote_the_table_is_told_nothing_of_it():
+    found = analyse(_logged(30.0, (600.0, 2220.0, 3900.0)), rule="robust")
+    assert not any("before its row" in warning for warning in found.model.warnings)
+    assert _true_ms(found.best_gains) < 1.5
