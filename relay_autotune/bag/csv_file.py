@@ -24,6 +24,17 @@ from relay_autotune.bag.arrays import FloatArray, IntArray
 from relay_autotune.bag.signals import TIME_UNITS, Selection, Signal, flags_of
 from relay_autotune.bag.source import open_regular
 from relay_autotune.bag.text_table import TextTable, Times, listed
+from relay_autotune.bag.words import (
+    COMMAND,
+    MEASUREMENT,
+    SETPOINT,
+    doubts_about,
+    is_date,
+    is_time,
+    role_of,
+    unit_in,
+    without_unit,
+)
 from relay_autotune.errors import BagError, NotThereError, SelectionError
 
 # Least time that is taken as seconds since 1970: no experiment lasts that long.
@@ -44,28 +55,10 @@ _UNITS = {
     "min": 6e10, "mins": 6e10, "minutes": 6e10, "h": 3.6e12, "hours": 3.6e12,
     "d": 8.64e13, "day": 8.64e13, "days": 8.64e13,
 }  # fmt: skip
-_UNIT = re.compile(r"\s*[\[(]\s*(?P<unit>[^\])]*?)\s*[\])]\s*$")
 # Days since 1899-12-30, as spreadsheets count them: those of 1970-01-01, those of a date from 1954
 # to 2119, and the longest mean step from row to row where nothing says that they are days: as
 # seconds, a faster logger than one of 1 kHz.
 _DAYS_OF_1970, _SERIAL, _SERIAL_STEP = 25569.0, (20_000.0, 80_000.0), 9e-4
-_DAYS = frozenset(("date", "datetime", "datum", "fecha"))
-# Words in the names of columns.
-_TIMES = frozenset(
-    ("time", "timestamp", "stamp", "date", "datetime", "clock", "elapsed", "millis", "micros",
-     "ms", "us", "sec", "seconds", "zeit", "tempo", "tiempo", "temps", "czas", "tijd", "tid")
-)  # fmt: skip
-_COMMANDS = frozenset(
-    ("u", "q", "cmd", "command", "control", "input", "heater", "duty", "pwm", "voltage", "volt",
-     "power", "pump", "valve", "fan", "dac", "effort", "torque", "throttle", "actuator",
-     "actuators", "op", "mv", "co", "esc", "drive")
-)  # fmt: skip
-_MEASUREMENTS = frozenset(
-    ("y", "t", "pv", "temp", "temperature", "rpm", "speed", "velocity", "omega", "position",
-     "angle", "level", "height", "pressure", "flow", "distance", "humidity", "measured",
-     "measurement", "actual", "sensor", "adc", "encoder")
-)  # fmt: skip
-_SETPOINTS = frozenset(("setpoint", "sp", "target", "reference", "ref", "desired"))
 # A text with many columns lets this many pairs be copied.
 _MOST_CHOICES = 6
 # Number of rows from which two stretches that overlap in time are two recordings.
@@ -174,10 +167,10 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
             notes.append(f"the time is taken from the column {name!r}")
         unit = wanted.time_unit or table.units.get(name)
         time_ns, dated = _nanoseconds(path, name, times, unit, notes)
-        if wanted.time is None and not _is_time(name):
+        if wanted.time is None and not is_time(name):
             _check_rises(path, name, time_ns)
     units = {
-        n: table.units.get(name) or _in_brackets(name) for n, name in zip("yu", names, strict=True)
+        n: table.units.get(name) or unit_in(name) for n, name in zip("yu", names, strict=True)
     }
     bounds = _recordings(time_ns)
     if len(bounds) > 2:
@@ -276,7 +269,7 @@ def _nanoseconds(
     step = float(np.median(np.abs(np.diff(time))))
     unit = given or _unit_of(name)
     scale = _UNITS.get(unit.lower()) if unit else None
-    in_days = scale == _UNITS["d"] or (scale is None and bool(_words(name) & _DAYS))
+    in_days = scale == _UNITS["d"] or (scale is None and is_date(name))
     if (scale is None or in_days) and _is_serial(time, math.inf if in_days else _SERIAL_STEP):
         notes.append(
             f"the column {name!r} is taken as days since 1899-12-30, as spreadsheets count dates; "
@@ -340,15 +333,10 @@ def _unwrapped(time: FloatArray, name: str, notes: list[str]) -> FloatArray:
 
 def _unit_of(name: str) -> str | None:
     """Return the unit that a name ends with, in brackets or as its last word."""
-    if unit := _in_brackets(name):
+    if unit := unit_in(name):
         return unit
     last = re.split(r"[\W_]+|(?<=[a-z])(?=[A-Z])", name.strip())[-1]
     return last if last.lower() in _UNITS else None
-
-
-def _in_brackets(name: str) -> str:
-    match = _UNIT.search(name)
-    return match["unit"] if match else ""
 
 
 def _check_rises(path: Path, name: str, time_ns: IntArray) -> None:
@@ -398,13 +386,14 @@ def _choose(
     rest = [k for k in range(len(names)) if k != time]
     if not pair and len(rest) == 2:
         pair = rest
-    choices, notes = _choices([names[k] for k in rest], given), []
-    if len(pair) < 2 and len(choices) == 1 and choices[0].named:
-        ((y, u, _),) = choices
+    choices, notes = _choices([names[k] for k in rest], given), doubts_about(*given)
+    if len(pair) < 2 and len(choices) == 1:
+        ((y, u, named),) = choices
         pair = [names.index(y), names.index(u)]
-        notes = [
+        why = "as their names say" if named else "since no other pair is possible"
+        notes += [
             f"of {len(names)} columns {y!r} is taken as the measurement and {u!r} as the command, "
-            "as their names say; --measurement and --command name others"
+            f"{why}; --measurement and --command name others"
         ]
     if len(pair) < 2:
         least = (
@@ -452,8 +441,8 @@ def _time(path: Path, names: Sequence[str], wanted: Selection, taken: Sequence[i
     if wanted.time is not None:
         return _named(path, names, wanted.time)
     # The first column, unless only another one is called so.
-    called_so = [k for k, name in enumerate(names) if k not in taken and _is_time(name)]
-    return called_so[0] if called_so and not _is_time(names[0]) else 0
+    called_so = [k for k, name in enumerate(names) if k not in taken and is_time(name)]
+    return called_so[0] if called_so and not is_time(names[0]) else 0
 
 
 class _Pair(NamedTuple):
@@ -470,9 +459,9 @@ def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[_Pair]:
     :param names: of the columns that are free.
     :param given: measurement and command, as far as they are named.
     """
-    free = [name for name in names if not _words(name) & _SETPOINTS]
-    hints = [[n for n in free if _hint(n) == way] for way in (-1, 1)]
-    unclear = [n for n in free if _hint(n) == 0]
+    roles = {name: role_of(name) for name in names}
+    hints = [[n for n in names if roles[n] == role] for role in (MEASUREMENT, COMMAND)]
+    unclear = [n for n in names if roles[n] is None]
     pair = [
         [name] if name is not None else hinted or unclear
         for name, hinted in zip(given, hints, strict=True)
@@ -481,25 +470,21 @@ def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[_Pair]:
     return found[:_MOST_CHOICES]
 
 
-def _hint(name: str) -> int:
-    """Return 1 for a column that is called like a command, -1 for one like a measurement."""
-    return bool(_words(name) & _COMMANDS) - bool(_words(name) & _MEASUREMENTS)
-
-
 def _swap(path: Path, names: Sequence[str], first: FloatArray, second: FloatArray) -> str:
     """Return why the first of two columns is the command; empty: the second is.
 
     :raises SelectionError: if one is a set-point, of which nothing can be identified.
     """
     for name in names:
-        if _words(name) & _SETPOINTS:
+        if role_of(name) == SETPOINT:
             raise SelectionError(
                 f"{path}: the column {name!r} seems to be a set-point; expected the command that "
                 "the controller put out; name columns with --measurement and --command if it is"
             )
-    hints = [_hint(name) for name in names]
-    if hints[0] != hints[1]:
-        return "as their names say" if hints[0] > hints[1] else ""
+    roles = [role_of(name) for name in names]
+    if roles[0] != roles[1]:
+        swapped = roles[0] == COMMAND or roles[1] == MEASUREMENT
+        return "as their names say" if swapped else ""
     if _steps(first) and not _steps(second):
         return "since it moves in steps"
     return ""
@@ -515,21 +500,10 @@ def _steps(values: FloatArray) -> bool:
     )
 
 
-def _words(name: str) -> frozenset[str]:
-    """Return the words of a name without its unit and without digits, in lower case."""
-    bare = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", _UNIT.sub("", name))
-    return frozenset(re.findall(r"[^\W\d_]+", bare.lower()))
-
-
-def _is_time(name: str) -> bool:
-    # "T" and "t1" are temperatures.
-    return bool(_words(name) & _TIMES) or re.match(r"t(?![^\W_])", name) is not None
-
-
 def _named(path: Path, names: Sequence[str], wanted: str) -> int:
     """Return the place of a column, whose name may be without its unit."""
     fits = [k for k, name in enumerate(names) if name == wanted] or [
-        k for k, name in enumerate(names) if _UNIT.sub("", name) == wanted
+        k for k, name in enumerate(names) if without_unit(name) == wanted
     ]
     if len(fits) > 1:
         raise SelectionError(

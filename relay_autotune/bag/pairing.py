@@ -30,14 +30,8 @@ from relay_autotune.bag.field_path import (
 from relay_autotune.bag.limits import MOST_SEARCHED
 from relay_autotune.bag.signals import Selection, Signal, flags_of
 from relay_autotune.bag.topics import Topics, split_name
+from relay_autotune.bag.words import SETPOINT, doubts_about, role_of
 from relay_autotune.errors import FieldError, NotThereError, SelectionError, visible
-
-_WORDS = {
-    "set-point": "setpoint reference ref target desired goal",
-    "command": "command cmd commands u actuator heater valve pump voltage pwm duty effort drive",
-    "measurement": "measurement measured measure y pv sensor feedback temperature temp level flow "
-    "pressure speed velocity position angle rpm height",
-}
 
 # Largest number of levels of a signal that steps between them.
 _MOST_LEVELS = 12
@@ -81,15 +75,9 @@ def characterise(signal: Signal) -> Character:
 
 def role_by_name(name: str) -> str | None:
     """Return what a topic's name says: set-point, command, measurement, or None."""
-    last = name.rstrip("/").rsplit("/", 1)[-1].lower()
-    if last == "controller_command":
-        # What a controller wants is not what the process gets.
-        return "set-point"
-    words = set(re.split(r"[^a-z]+", last))
-    for role, known in _WORDS.items():
-        if words & set(known.split()) or (role == "set-point" and {"set", "point"} <= words):
-            return role
-    return None
+    last = name.rstrip("/").rsplit("/", 1)[-1]
+    # What a controller wants is not what the process gets.
+    return SETPOINT if last.lower() == "controller_command" else role_of(last)
 
 
 def pair_of(topics: Topics, wanted: Selection) -> tuple[tuple[str, str], list[str]]:
@@ -99,11 +87,11 @@ def pair_of(topics: Topics, wanted: Selection) -> tuple[tuple[str, str], list[st
     :param wanted: the topics, as far as they are named, or the joint that they are of.
     :raises SelectionError: if the names do not fit, or more than one pair does.
     """
-    notes: list[str] = []
     measurement, command = wanted.measurement, wanted.command
+    notes = doubts_about(*(n and n.rstrip("/").rsplit("/", 1)[-1] for n in (measurement, command)))
     if wanted.joint:
         measurement, command, why = named_pair(topics, wanted)
-        notes = [f"using {flags_of(measurement, command)}: {why}"]
+        notes += [f"using {flags_of(measurement, command)}: {why}"]
     if measurement is not None and command is not None:
         names = (
             _checked(topics, "measurement", measurement),
@@ -123,7 +111,9 @@ def pair_of(topics: Topics, wanted: Selection) -> tuple[tuple[str, str], list[st
             f"with --measurement TOPIC --command TOPIC"
         )
     signals = [timed.signal for timed in topics.signals().values()]
-    return _only(topics, plausible_pairs(signals, **({} if given is None else {role: given})))
+    pairs = plausible_pairs(signals, **({} if given is None else {role: given}))
+    chosen, reasons = _only(topics, pairs)
+    return chosen, [*notes, *reasons]
 
 
 def _checked(topics: Topics, role: str, wanted: str) -> str:

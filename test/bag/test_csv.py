@@ -60,6 +60,54 @@ def test_more_columns_are_named(tmp_path):
         read_experiments(path, Selection("note", "u", "t"))
 
 
+NAMED = [
+    # time, set-point, measurement, command, and the units of the last two
+    (("Zeit", "Sollwert (°C)", "Istwert (°C)", "Stellgröße (%)"), {"y": "°C", "u": "%"}),
+    (("temps", "consigne", "mesure", "commande"), {}),
+    (("tiempo", "Consigna (bar)", "Medida (bar)", "Salida (%)"), {"y": "bar", "u": "%"}),
+    (("Tempo", "riferimento", "misura", "uscita"), {}),
+    (("Datum", "T_soll °C", "T_ist °C", "Ventil %"), {"y": "°C", "u": "%"}),
+    (("Time", "PIC7_SP_bar", "PIC7_PV_bar", "PIC7_CV_pct"), {"y": "bar", "u": "%"}),
+    (("Time (min)", "Level SP (%)", "Level PV (%)", "Out (%)"), {"y": "%", "u": "%"}),
+    (("Elapsed ms", "Target", "T3 degC", "Heater %"), {"y": "degC", "u": "%"}),
+]
+
+
+@pytest.mark.parametrize(("names", "units"), NAMED, ids=lambda case: str(case)[:40])
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (0, 3, 1, 2)])
+def test_the_one_pair_that_names_allow_is_taken_and_said(tmp_path, names, units, order):
+    cells = [line(k).split(",") for k in range(20)]
+    rows = [[t, "40", y, u] for t, y, u in cells]
+    text = "\n".join(";".join(row[k] for k in order) for row in [list(names), *rows])
+    found = read_experiments(write(tmp_path / "a.csv", text))
+    (record,) = found.experiments
+    assert record.measurement.tolist() == [float(y) for _, y, _ in cells]
+    assert record.units == units
+    _, _, y, u = names
+    assert any(f"{y!r} is taken as the measurement and {u!r} as the" in n for n in found.notes)
+
+
+def test_one_column_that_is_left_is_the_command_only_if_no_other_is(tmp_path):
+    text = "t,SP,PV,A,B\n" + "\n".join(line(k).replace(",", ",40,", 1) + ",7" for k in range(20))
+    with pytest.raises(SelectionError, match="name two of them") as refused:
+        read_experiments(write(tmp_path / "a.csv", text))
+    assert str(refused.value).count("--measurement PV --command") == 2
+
+
+def test_names_that_say_otherwise_than_the_flags_are_told(tmp_path):
+    text = "t,SP,PV,CO\n" + "\n".join(
+        "{0},{2},{1},{2}".format(*line(k).split(",")) for k in range(20)
+    )
+    path = write(tmp_path / "a.csv", text)
+
+    def notes(*chosen):
+        return " ".join(read_experiments(path, Selection(*chosen, end=99.0)).notes)
+
+    assert "--command 'SP' is called like a set-point" in notes("PV", "SP")
+    assert "exchange them" in notes("CO", "PV")
+    assert notes("PV", "CO") == ""
+
+
 @pytest.mark.parametrize(("day", "told"), [("04/05", True), ("21/05", False), ("05/05", False)])
 def test_a_date_that_could_be_two_is_told(tmp_path, day, told):
     rows = "".join(f"{day}/2026 06:59:{k:02},{k % 5},{k // 3 % 2}\n" for k in range(12))
