@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from relay_autotune.arrays import ComplexArray, FloatArray
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.limit_cycle.fold import LEAST_CYCLES
 from relay_autotune.identification.limit_cycle.limit_cycle import RelayTest
@@ -23,8 +23,6 @@ from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import result_field
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings, cached_on_record
-
-_SMALL_ANGLE = 0.2
 
 
 @dataclass(frozen=True)
@@ -73,30 +71,14 @@ def fourier_integral_sampled(
     inside = (time > start) & (time < end)
     t = np.concatenate(([start], time[inside], [end]))
     v = np.concatenate((np.interp([start], time, y), y[inside], np.interp([end], time, y)))
-    h = np.diff(t)
-    angle = w * h
-    level, ramp = _polygon(angle)
-    parts = h * np.exp(-1j * w * t[:-1]) * (v[:-1] * level + np.diff(v) * ramp)
-    return complex(np.sum(parts))
-
-
-def _polygon(angle: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-    """Return the integrals of ``exp(-j angle x)`` and ``x exp(-j angle x)`` over 0 < x < 1.
-
-    About the middle they are ``sin(b)/b`` and ``-j (sin(b) - b cos(b))/(2 b^2)`` with half the
-    angle b, whose difference is a series where b is small.
-    """
-    b = 0.5 * angle
-    square = b * b
-    odd = b * (1.0 / 6.0 - square * (1.0 / 60.0 - square * (1.0 / 1680.0 - square / 90720.0)))
-    even = np.sinc(b / math.pi)
-    large = np.abs(angle) >= _SMALL_ANGLE
-    if np.any(large):
-        c = b[large]
-        odd[large] = 0.5 * (np.sin(c) - c * np.cos(c)) / (c * c)
-    middle = np.exp(-1j * b)
-    level = middle * even
-    return level, 0.5 * level - 1j * odd * middle
+    h, rise = np.diff(t), np.diff(v)
+    if w == 0.0:
+        return complex(np.sum((v[:-1] + 0.5 * rise) * h))
+    # By parts: the two ends, and the rise along each line, or of a jump.
+    turns = np.exp(-1j * w * t)
+    moved = np.divide(np.diff(turns), h, out=-1j * w * turns[:-1], where=h > 0.0)
+    ends = (v[0] * turns[0] - v[-1] * turns[-1]) / 1j
+    return complex((ends + np.sum(rise * moved) / w) / w)
 
 
 def frequency_point(record: Record, ends: FloatArray, harmonic: int = 1) -> FrequencyPoint:

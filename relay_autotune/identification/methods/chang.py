@@ -416,12 +416,8 @@ def _identified(problem: LagProblem, known: Known, source: str, *, ideal: bool) 
             f"eqs 1 and 2 give K_u = {k_u:.4g} and w_u = {w_u:.4g} rad/s, but the hysteresis "
             "keeps the limit cycle off the ultimate point; K_u and w_u are those of the model"
         )
-    identification = solved(
-        *(method.name, model, values, problem.reading),
-        sign=sign,
-        extra_delay=extra_delay,
-        remarks=remarks,
-    )
+    found = method.name, model, values, problem.reading
+    identification = solved(*found, test=test, sign=sign, remarks=remarks)
     if method is not ATV or not ideal:
         return identification
     spread = problem.reading.carried(lambda x: np.array(ultimate_estimate(problem.at(x))))

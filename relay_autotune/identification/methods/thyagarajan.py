@@ -21,7 +21,11 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.limit_cycle.fold import Reading
-from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle, relay_test
+from relay_autotune.identification.limit_cycle.limit_cycle import (
+    RelayTest,
+    SymmetricCycle,
+    relay_test,
+)
 from relay_autotune.identification.limit_cycle.shape import (
     VARYING,
     Shape,
@@ -174,16 +178,16 @@ def identify_thyagarajan(record: Record, known: Known = NOTHING) -> Identificati
     if one_lag and shape.category in ("2", "3"):
         # One lag has sharp peaks, though noise may hide them.
         shape, reading = read_shape(record, sharp=True)
-    extra = test.settings.extra_delay
-    row = _chosen(shape, reading, replace(known, dead_time=known.dead_time + extra))
+    asked = replace(known, dead_time=known.dead_time + test.settings.extra_delay)
+    row = _chosen(shape, reading, asked)
     why = (
         f"the shape is of category {shape.category} (q = {shape.sharpness:.2f}, tau_G/P = "
         f"{shape.growth:.2f}, plateau {shape.plateau:.2f} of the half period)"
         + (f": {row.text}" if row.text else "")
     )
     remarks = [why, *test.remarks(), *_refinements(shape, record)]
-    relay = test.settings.amplitude * test.sign
-    return _identified(row, shape, reading, relay, known.dead_time, extra, remarks)
+    relay = test.settings.amplitude
+    return _identified(row, shape, reading, relay, asked.dead_time, test, remarks)
 
 
 def identify_numbers(shape: Shape, relay: float, known: Known, categorised: str) -> Identification:
@@ -197,7 +201,7 @@ def identify_numbers(shape: Shape, relay: float, known: Known, categorised: str)
     """
     reading = Reading(np.array([getattr(shape, name) for name in VARYING]))
     row = _chosen(shape, reading, known, categorised)
-    return _identified(row, shape, reading, relay, known.dead_time, 0.0, [])
+    return _identified(row, shape, reading, relay, known.dead_time, None, [])
 
 
 def _chosen(shape: Shape, reading: Reading, known: Known, categorised: str = "") -> Row:
@@ -207,16 +211,14 @@ def _chosen(shape: Shape, reading: Reading, known: Known, categorised: str = "")
     :param categorised: category; default: that of the shape.
     """
     category, dead_time = categorised or shape.category, known.dead_time
-    order = {"2": 2}.get(category, HIGHER_ORDER)
+    order = 2 if category == "2" else HIGHER_ORDER
     if known.structure == LAG_N.name and not known.order:
         known = replace(known, order=order)
     structure = structure_asked_for(METHOD, known, _STRUCTURES)
-    if structure == UNSTABLE_FOPDT:
-        return replace(_UNSTABLE_FOPDT, text="")
-    if structure == FOPDT:
-        return replace(FLAT_FOPDT if category == "1b" else SHARP_FOPDT, text="")
     if structure is not None:
-        return replace(_lags(structure.order, dead_time), text="")
+        one_lag = FLAT_FOPDT if category == "1b" else SHARP_FOPDT
+        rows = {FOPDT: one_lag, UNSTABLE_FOPDT: _UNSTABLE_FOPDT}
+        return replace(rows.get(structure) or _lags(structure.order, dead_time), text="")
     if category in ("2", "3"):
         return _lags(order, dead_time)
     if category == "1b":
@@ -235,36 +237,29 @@ def _identified(
     reading: Reading,
     relay: float,
     dead_time: float,
-    extra: float,
+    test: RelayTest | None,
     remarks: list[str],
 ) -> Identification:
     """Solve a row, with a dead time that is known in the place of the time to the peak."""
     if not math.isnan(dead_time):
-        reading = reading.with_number(_PEAK, dead_time + extra, 0.0)
+        reading = reading.with_number(_PEAK, dead_time, 0.0)
 
     def at(numbers: FloatArray) -> Shape:
         return replace(shape, **dict(zip(VARYING, numbers.tolist(), strict=True)))
 
-    def values(numbers: FloatArray) -> Sequence[float]:
+    def values(numbers: FloatArray, *, literal: bool = False) -> Sequence[float]:
         moved = at(numbers)
-        return _of_relay(row.solve(moved, moved.level))
+        gain, *others = row.solve(moved, None if literal else moved.level)
+        return gain / abs(relay), *others
 
-    def _of_relay(found: Sequence[float]) -> tuple[float, ...]:
-        return found[0] / abs(relay), *found[1:]
-
-    read = at(reading.values)
+    here = reading.values
     remarks += literally(
-        row.paper,
-        row.structure,
-        lambda: _of_relay(row.solve(read, None)),
-        values(reading.values),
+        row.paper, row.structure, lambda: values(here, literal=True), values(here)
     )
     if row.structure.order == 2 and math.isnan(dead_time):
-        remarks += _sensitive(read)
-    sign = 1 if relay > 0.0 else -1
-    return solved(
-        *(METHOD, row.structure, values, reading), sign=sign, extra_delay=extra, remarks=remarks
-    )
+        remarks += _sensitive(at(here))
+    sign, found = 1 if relay > 0.0 else -1, (METHOD, row.structure, values, reading)
+    return solved(*found, test=test, sign=sign, remarks=remarks)
 
 
 def _sensitive(shape: Shape) -> list[str]:

@@ -353,8 +353,7 @@ def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
     reading = reading.with_number(7, 0.0, rest.std if rest.measured else 0.0)
     return solved(
         *("wang_biased", FOPDT, equations, reading),
-        sign=sign,
-        extra_delay=settings.extra_delay,
+        test=test,
         remarks=["" if rest.measured else UNKNOWN_REST, *test.remarks(symmetric=False)],
     )
 
@@ -371,9 +370,8 @@ def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
     :raises IdentificationError: if the relay was biased, or no FOPDT process has the limit cycle.
     """
     test = relay_test("wang_unbiased", record)
-    settings = test.settings
     test.require_unbiased()
-    gain, mu = test.known_gain(known), settings.amplitude
+    gain, mu = test.known_gain(known), test.settings.amplitude
 
     def equations(numbers: FloatArray) -> Fopdt:
         period, amplitude, epsilon, ratio = numbers.tolist()
@@ -398,8 +396,7 @@ def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
             remark, reading = _LIKE_AN_INTEGRATOR, reading.with_number(3, likely, std)
     return solved(
         *("wang_unbiased", FOPDT, equations, reading),
-        sign=test.sign,
-        extra_delay=settings.extra_delay,
+        test=test,
         remarks=[remark, *test.remarks(symmetric=False)],
     )
 
