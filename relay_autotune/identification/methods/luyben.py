@@ -21,11 +21,10 @@ r = (tau1 + tau2)/tau2 and z = t2/tau2 only one monotone equation has to be solv
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
@@ -36,7 +35,7 @@ from relay_autotune.identification.result import FitReport, Identification
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import INTEGRATOR_INVERSE
 from relay_autotune.record.record import PiecewiseConstant, Record
-from relay_autotune.scalar import minimum_near
+from relay_autotune.scalar import minimum_near, root
 
 _SMALL = 1e-3
 _LARGEST = 1e8
@@ -69,15 +68,12 @@ def from_step(t1: float, t2: float, extremum: float, step: float) -> tuple[float
     def excess(z: float) -> float:
         return _ratio(z) - ratio
 
-    high = 1.0
-    while excess(high) < 0.0:
-        high *= 4.0
-        if high > _LARGEST:
-            raise IdentificationError(
-                f"a return {ratio:g} times later than the extremum is no response of this "
-                "structure: its lag would vanish"
-            )
-    z = float(brentq(excess, 0.0, high, xtol=1e-16, rtol=1e-15))
+    if excess(_LARGEST) < 0.0:
+        raise IdentificationError(
+            f"a return {ratio:g} times later than the extremum is no response of this structure: "
+            "its lag would vanish"
+        )
+    z = root(excess, 0.0, _LARGEST, 1e-16)
     if z == 0.0:
         raise IdentificationError(
             "the return comes at just twice the time of the extremum, so that the inverse "
@@ -131,27 +127,6 @@ class StepTest:
     y: FloatArray
 
 
-@dataclass(frozen=True)
-class StepCurve:
-    """The baseline, and a polynomial that leaves it when the dead time is over.
-
-    :param dead_time: D [s].
-    :param span: how far beyond the dead time the polynomial reaches [s].
-    :param coefficients: of T_k(2 x - 1) - T_k(-1), T_k Chebyshev's polynomials, k = 1, 2, ...; and
-        the baseline last [y].
-    """
-
-    dead_time: float
-    span: float
-    coefficients: FloatArray
-
-    def polynomial(self) -> np.polynomial.Chebyshev:
-        """Return the deviation from the baseline against the time since the dead time ended."""
-        c = self.coefficients[:-1]
-        constant = -float(np.sum(c * (-1.0) ** np.arange(1, c.size + 1)))
-        return np.polynomial.Chebyshev(np.concatenate(([constant], c)), domain=[0.0, self.span])
-
-
 def identify_step(record: Record, known: Known = NOTHING) -> Identification:
     """Identify an integrating process with inverse response from a step test (eqs 4 to 6).
 
@@ -163,20 +138,16 @@ def identify_step(record: Record, known: Known = NOTHING) -> Identification:
     structure_asked_for(METHOD, known, (INTEGRATOR_INVERSE,))
     test = step_test(record)
     noise = _noise(test, record.noise_std)
-    curve, covariance = _fitted(test, _return_time(test, noise), known.dead_time)
-    end = curve.dead_time + curve.span
-
-    def equations(numbers: FloatArray) -> Sequence[float]:
-        dead_time = float(numbers[0])
-        return _values(StepCurve(dead_time, end - dead_time, numbers[1:]), test.step)
-
-    numbers = np.concatenate(([curve.dead_time], curve.coefficients))
-    reading = Reading(numbers, covariance, test.y.size)
-    found = solved(METHOD, INTEGRATOR_INVERSE, equations, reading)
+    reading, end = _read_curve(test, _return_time(test, noise), known.dead_time)
+    found = solved(
+        *(METHOD, INTEGRATOR_INVERSE),
+        lambda numbers: _values(numbers, end, test.step),
+        reading,
+    )
     # The whole step response, as far as the command kept still.
     u = PiecewiseConstant(np.array([test.begin]), np.array([test.step]), 0.0)
     fitted = np.full(len(record), math.nan)
-    fitted[: test.time.size] = curve.coefficients[-1] + response(found.model, test.time, u)
+    fitted[: test.time.size] = reading.values[-1] + response(found.model, test.time, u)
     left = float(np.sqrt(np.nanmean((record.measurement - fitted) ** 2)))
     spread = float(np.std(test.y))
     warnings = found.warnings
@@ -272,94 +243,97 @@ def _return_time(test: StepTest, noise: float) -> float:
     return float(since[i])
 
 
-def _fitted(test: StepTest, until: float, known: float) -> tuple[StepCurve, FloatArray | None]:
-    """Return the smooth curve, and the covariance of dead time, coefficients and baseline."""
-    end = test.begin + _BEYOND * until
-    part = test.time <= end
-    stride = max(1, int(np.count_nonzero(part)) // _MOST_POINTS)
-    # Neighbours are averaged, those before the step apart from those after it.
-    first = int(np.searchsorted(test.time, test.begin, side="right")) % stride
-    edges = np.arange(first, int(np.count_nonzero(part)), stride)
-    count = np.diff(np.append(edges, np.count_nonzero(part)))
-    time, y = (np.add.reduceat(x[part], edges) / count for x in (test.time, test.y))
-    since = time - test.begin
-    span = _BEYOND * until
-    n = y.size
-    floor = n * (_NEGLIGIBLE * float(np.ptp(y))) ** 2 or 1e-300
+def _read_curve(test: StepTest, until: float, known: float) -> tuple[Reading, float]:
+    """Read a smooth curve: the baseline, and a polynomial that leaves it after the dead time.
 
-    def solved(dead_time: float, powers: int) -> tuple[float, FloatArray, FloatArray]:
-        columns = _columns(since, dead_time, span - dead_time, powers)
+    :param test: the step.
+    :param until: roughly when the measurement returns, from the step on [s].
+    :param known: the dead time [s]; NaN: the one with which the curve fits best.
+    :return: the dead time, the coefficients of T_k(2 x - 1) - T_k(-1), T_k Chebyshev's polynomials
+        with k = 1, 2, ..., and the baseline; and where the polynomial ends [s].
+    """
+    end = _BEYOND * until
+    count = int(np.count_nonzero(test.time <= test.begin + end))
+    # Neighbours are averaged, those before the step apart from those after it.
+    stride = max(1, count // _MOST_POINTS)
+    first = int(np.searchsorted(test.time, test.begin, side="right")) % stride
+    edges = np.arange(first, count, stride)
+    weight = np.diff(np.append(edges, count))
+    time, y = (np.add.reduceat(x[:count], edges) / weight for x in (test.time, test.y))
+    since, n = time - test.begin, y.size
+    floor = n * (_NEGLIGIBLE * float(np.ptp(y))) ** 2 or 1e-300
+    # The extremum comes after the dead time and before the return.
+    places = np.linspace(0.0, until, _PLACES, endpoint=False)
+
+    def fitted(dead_time: float, powers: int) -> tuple[float, FloatArray, FloatArray]:
+        x = np.clip(2.0 * (since - dead_time) / (end - dead_time) - 1.0, -1.0, 1.0)
+        moved = np.polynomial.chebyshev.chebvander(x, powers)[:, 1:] - _at_begin(powers)
+        columns = np.column_stack((moved, np.ones(n)))
         solution = np.linalg.lstsq(columns, y, rcond=1e-12)[0]
         rest = y - columns @ solution
         return float(rest @ rest), np.asarray(solution), columns
 
-    # The extremum comes after the dead time and before the return.
-    places = np.linspace(0.0, until, _PLACES, endpoint=False)
-    best: tuple[float, float, int] | None = None
-    dead_time, worse = known, 0
+    def placed(near: float, powers: int) -> float:
+        """Return the dead time of the least sum of squares, next to another one."""
+        if not math.isnan(known):
+            return known
+
+        def left(place: float) -> float:
+            return fitted(place, powers)[0]
+
+        # With few powers the end of the dead time is searched for everywhere.
+        away = [left(p) for p in places] if powers <= _SEARCHED else np.abs(places - near)
+        i = int(np.argmin(away))
+        found, least = minimum_near(left, places, i, 1e-9 * float(places[-1]))
+        # The search does not try its ends.
+        return 0.0 if i <= 1 and left(0.0) <= least else found
+
+    best, dead_time, worse = (math.inf, 0.0, 0), known, 0
     for powers in range(2, min(_MOST_POWERS, n // 4) + 1):
-        if math.isnan(known):
-
-            def left(place: float, powers: int = powers) -> float:
-                return solved(place, powers)[0]
-
-            # With few powers the end of the dead time is searched for everywhere, then near it.
-            if powers <= _SEARCHED:
-                dead_time = float(places[np.argmin([left(p) for p in places])])
-            dead_time = _refined(left, dead_time, places)
-        cost = max(solved(dead_time, powers)[0], floor)
+        dead_time = placed(dead_time, powers)
+        cost = max(fitted(dead_time, powers)[0], floor)
         criterion = n * math.log(cost) + 2.0 * (powers + 2) * n / max(n - powers - 3, 1)
-        worse += 1
-        if best is None or criterion < best[0]:
-            best, worse = (criterion, dead_time, powers), 0
-        elif worse > _PATIENCE:
+        worse = 0 if criterion < best[0] else worse + 1
+        best = min(best, (criterion, dead_time, powers))
+        if worse > _PATIENCE:
             break
-    if best is None:
+    if not best[-1]:
         raise IdentificationError(
             f"the inverse response holds {n} samples, too few to read it: sample faster"
         )
-    _, dead_time, powers = best
     # One power more than fits best, so that the intervals hold the noise and no missing power.
-    powers = min(powers + 1, _MOST_POWERS)
-    if math.isnan(known):
-        dead_time = _refined(lambda p: solved(p, powers)[0], dead_time, places)
-    cost, solution, columns = solved(dead_time, powers)
-    curve = StepCurve(dead_time, span - dead_time, solution)
-    jacobian = columns
-    if math.isnan(known):
-        slope = curve.polynomial().deriv()(np.maximum(since - dead_time, 0.0))
-        by_dead_time = np.where(since > dead_time, -slope, 0.0)
-        jacobian = np.column_stack((by_dead_time, columns))
-    degrees = n - jacobian.shape[1]
-    if degrees < 1:
-        return curve, None
-    covariance = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14) * (cost / degrees)
-    if not math.isnan(known):
-        covariance = np.pad(covariance, ((1, 0), (1, 0)))
-    return curve, np.asarray(covariance)
+    powers = min(best[-1] + 1, _MOST_POWERS)
+    dead_time = placed(best[1], powers)
+    cost, solution, columns = fitted(dead_time, powers)
+    numbers = np.concatenate(([dead_time], solution))
+    late = since - dead_time
+    slope = _deviation(numbers, end).deriv()(np.maximum(late, 0.0))
+    by_dead_time = np.where((late > 0.0) & math.isnan(known), -slope, 0.0)
+    slopes = np.column_stack((by_dead_time, columns))
+    freedom = n - slopes.shape[1] + (not math.isnan(known))
+    if freedom < 1:
+        return Reading(numbers, None, test.y.size), end
+    covariance = np.linalg.pinv(slopes.T @ slopes, rcond=1e-14) * (cost / freedom)
+    return Reading(numbers, np.asarray(covariance), test.y.size), end
 
 
-def _refined(left: Callable[[float], float], near: float, places: FloatArray) -> float:
-    """Return the dead time of the least sum of squares, between the two places about one."""
-    i = int(np.argmin(np.abs(places - near)))
-    found, least = minimum_near(left, places, i, 1e-9 * float(places[-1]))
-    # The search does not try its ends.
-    return 0.0 if i <= 1 and left(0.0) <= least else found
+def _at_begin(powers: int) -> FloatArray:
+    """Return T_k(-1) for k = 1, 2, ..., shape (powers,)."""
+    return (-1.0) ** np.arange(1, powers + 1)
 
 
-def _columns(since: FloatArray, dead_time: float, span: float, powers: int) -> FloatArray:
-    x = np.clip(2.0 * (since - dead_time) / span - 1.0, -1.0, 1.0)
-    chebyshev = np.polynomial.chebyshev.chebvander(x, powers)[:, 1:]
-    moved = chebyshev - (-1.0) ** np.arange(1, powers + 1)
-    return np.column_stack((moved, np.ones(since.size)))
+def _deviation(numbers: FloatArray, end: float) -> np.polynomial.Chebyshev:
+    """Return the deviation from the baseline against the time since the dead time ended."""
+    c = numbers[1:-1]
+    constant = -float(c @ _at_begin(c.size))
+    return np.polynomial.Chebyshev((constant, *c), domain=[0.0, end - numbers[0]])
 
 
-def _values(curve: StepCurve, step: float) -> Sequence[float]:
+def _values(numbers: FloatArray, end: float, step: float) -> Sequence[float]:
     """Read extremum and return off the curve, and solve."""
-    deviation = curve.polynomial()
-    slope = deviation.deriv()
-    turns = _real_roots(slope, curve.span)
-    side = math.copysign(1.0, float(deviation(curve.span)))
+    deviation, span = _deviation(numbers, end), end - float(numbers[0])
+    turns = _real_roots(deviation.deriv(), span)
+    side = math.copysign(1.0, float(deviation(span)))
     turns = turns[side * deviation(turns) < 0.0]
     if turns.size == 0:
         raise IdentificationError(
@@ -367,13 +341,13 @@ def _values(curve: StepCurve, step: float) -> Sequence[float]:
             "integrating process with inverse response, or noise hides it"
         )
     t1 = float(turns[np.argmin(side * deviation(turns))])
-    returns = _real_roots(deviation, curve.span)
+    returns = _real_roots(deviation, span)
     returns = returns[returns > t1]
     if returns.size == 0:
         raise IdentificationError(
             "the measurement does not come back to where it was before the step: record longer"
         )
-    return *from_step(t1, float(returns[0]), float(deviation(t1)), step), curve.dead_time
+    return *from_step(t1, float(returns[0]), float(deviation(t1)), step), float(numbers[0])
 
 
 def _real_roots(polynomial: np.polynomial.Chebyshev, span: float) -> FloatArray:
