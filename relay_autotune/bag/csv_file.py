@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from relay_autotune.bag.arrays import FloatArray, IntArray
 from relay_autotune.bag.signals import TIME_UNITS, Selection, Signal, flags_of
@@ -68,6 +69,8 @@ _LONGEST_STEP = 3600.0
 # Range of a counter of milliseconds or microseconds, and what its numbers may be divided by.
 _COUNTERS = (2.0**32, 2.0**16)
 _COUNTED = (1.0, 1e-3, 1e-6)
+# An hour [ns], and largest share of rows that a clock which was not set has stamped.
+_HOUR, _UNSET = 3600 * 10**9, 0.02
 # Usual steps from the last time before a counter wraps around to the first one behind it.
 _FEW_STEPS = 3.0
 # Smallest jump of a command that steps, as a share of its range, and largest share of rows with
@@ -148,6 +151,7 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
     with _table(path) as table:
         time, pair, said = _choose(path, table.names, wanted)
         times, (y, u) = table.columns(time, pair)
+    lines = table.lines
     notes = [*table.notes, *said]
     names = [table.names[at] for at in pair]
     if wanted.measurement is None and wanted.command is None:
@@ -169,14 +173,15 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
         time_ns, dated = _nanoseconds(path, name, times, unit, notes)
         if wanted.time is None and not is_time(name):
             _check_rises(path, name, time_ns)
+        y, u, time_ns, lines = _without_1970(name, dated, (y, u, time_ns, lines), notes)
     units = {
         n: table.units.get(name) or unit_in(name) for n, name in zip("yu", names, strict=True)
     }
     bounds = _recordings(time_ns)
     if len(bounds) > 2:
-        lines = ", ".join(str(table.lines[at]) for at in bounds[1:-1])
+        where = ", ".join(str(lines[at]) for at in bounds[1:-1])
         notes.append(
-            f"the time starts anew at line {lines}: {len(bounds) - 1} recordings are read, one "
+            f"the time starts anew at line {where}: {len(bounds) - 1} recordings are read, one "
             "after the other"
         )
     logs = []
@@ -201,7 +206,14 @@ def _log(
         notes.append(f"the time goes back at {back} rows; rows are put into its order")
     order = np.argsort(time_ns, kind="stable")
     time_ns = time_ns[order]
-    same = int(np.count_nonzero(np.diff(time_ns) == 0))
+    values = values[0][order], values[1][order]
+    again = np.append(False, np.diff(time_ns) == 0)
+    twice = again & np.append(False, np.all([_same(v[1:], v[:-1]) for v in values], axis=0))
+    if np.any(twice) and np.array_equal(twice, again):
+        notes.append(f"{np.count_nonzero(twice)} rows stand twice, and count once")
+        time_ns, values = time_ns[~twice], (values[0][~twice], values[1][~twice])
+        again = again[~twice]
+    same = int(np.count_nonzero(again))
     if 2 * same > time_ns.size:
         time_ns, rows = _spread(time_ns)
         notes.append(
@@ -214,8 +226,7 @@ def _log(
             "counts from then on"
         )
     signals = []
-    for name, column in zip(names, values, strict=True):
-        ordered = column[order]
+    for name, ordered in zip(names, values, strict=True):
         there = ~np.isnan(ordered)
         if not there.all():
             gap = _longest_gap(time_ns[there])
@@ -225,6 +236,10 @@ def _log(
             )
         signals.append(Signal(name, time_ns[there], ordered[there]))
     return Log(signals[0], signals[1], dated, {}, tuple(notes))
+
+
+def _same(values: FloatArray, others: FloatArray) -> NDArray[np.bool_]:
+    return (values == others) | (np.isnan(values) & np.isnan(others))
 
 
 def _spread(time_ns: IntArray) -> tuple[IntArray, float]:
@@ -257,13 +272,13 @@ def _nanoseconds(
                 "be counted in nanoseconds; expected those of a recording"
             )
         notes.append(f"the column {name!r} is taken as dates in UTC, unless they name a zone")
-        return np.array(times.dates, dtype=np.int64), True
+        return _summer_time(name, np.array(times.dates, dtype=np.int64), notes), True
     if times.clock:
         notes.append(f"the column {name!r} is taken as the time of day")
         clock = np.array(times.clock, dtype=np.int64)
         half_day = 43200 * 10**9
         midnights = np.cumsum(np.diff(clock, prepend=clock[0]) < -half_day)
-        return clock + 2 * half_day * midnights, False
+        return _summer_time(name, clock + 2 * half_day * midnights, notes), False
     time = _unwrapped(np.array(times.numbers), name, notes)
     largest = float(np.abs(time).max())
     step = float(np.median(np.abs(np.diff(time))))
@@ -307,6 +322,43 @@ def _nanoseconds(
     whole = np.floor(time)
     ns = whole.astype(np.int64) * int(scale) + np.round((time - whole) * scale).astype(np.int64)
     return ns, bool(ns[0] > EPOCH * 1e9)
+
+
+def _summer_time(name: str, time_ns: IntArray, notes: list[str]) -> IntArray:
+    """Return times of a clock that may be set back by an hour, so that they go on rising."""
+    moves = np.diff(time_ns)
+    usual = float(np.median(np.abs(moves)))
+    back = (moves + _HOUR > 0) & (moves + _HOUR <= _FEW_STEPS * usual) & (moves < 0)
+    if not np.any(back) or usual > _HOUR / 10:
+        return time_ns
+    rows = ", ".join(map(str, np.flatnonzero(back) + 2))
+    notes.append(
+        f"the clock of {name!r} is set back by an hour at row {rows} of numbers, as at the end of "
+        "summer time, and is counted on"
+    )
+    return time_ns + np.append(0, _HOUR * np.cumsum(back))
+
+
+def _without_1970(
+    name: str,
+    dated: bool,
+    rows: tuple[FloatArray, FloatArray, IntArray, IntArray],
+    notes: list[str],
+) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+    """Return rows of columns without those few that a clock which was not set yet has stamped.
+
+    :param rows: two columns, the times [ns] and the lines.
+    """
+    unset = rows[2] < EPOCH * 1e9
+    count = int(np.count_nonzero(unset))
+    if not dated or not 0 < count <= _UNSET * unset.size:
+        return rows
+    notes.append(
+        f"rows whose {name!r} is before 1973 are left out, since their clock was not set: "
+        f"{count}, the first in line {rows[3][unset][0]}"
+    )
+    y, u, time_ns, lines = rows
+    return y[~unset], u[~unset], time_ns[~unset], lines[~unset]
 
 
 def _is_serial(time: FloatArray, longest: float) -> bool:
@@ -459,6 +511,7 @@ def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[_Pair]:
     :param names: of the columns that are free.
     :param given: measurement and command, as far as they are named.
     """
+    names = list(dict.fromkeys(names))
     roles = {name: role_of(name) for name in names}
     hints = [[n for n in names if roles[n] == role] for role in (MEASUREMENT, COMMAND)]
     unclear = [n for n in names if roles[n] is None]
@@ -507,7 +560,8 @@ def _named(path: Path, names: Sequence[str], wanted: str) -> int:
     ]
     if len(fits) > 1:
         raise SelectionError(
-            f"{path} has {len(fits)} columns named {wanted!r}; expected a name of its own for each"
+            f"{path} has {len(fits)} columns named {wanted!r}; expected a name of its own for "
+            "each: change them in its header line"
         )
     if not fits:
         raise NotThereError(f"{path} has no column {wanted!r}", f"its columns are {listed(names)}")

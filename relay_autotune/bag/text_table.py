@@ -352,9 +352,15 @@ class TextTable:
 
     def _no_number(self, line: int, at: int, cell: str, *, finite: bool = False) -> BagError:
         shown = cell if finite else repr(visible(cell))
+        hint = ""
+        if self._separator == "," and _is_number(cell.replace(",", "")) and "," in cell:
+            hint = (
+                ": where commas separate columns, a number has none; save the table with decimal "
+                "points and without separators of thousands, or with semicolons between columns"
+            )
         return BagError(
             f"{self._path}, line {line}: {self.names[at]!r} is {shown}; expected a "
-            f"{'finite ' if finite else ''}number"
+            f"{'finite ' if finite else ''}number{hint}"
         )
 
 

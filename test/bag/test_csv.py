@@ -437,6 +437,58 @@ def test_tables_as_programs_write_them(tmp_path, way):
     same_as_plain(tmp_path, read_experiments(write(tmp_path / "a.txt", text), wanted))
 
 
+def dated(at, k):
+    """Return a row at a local time, of the plain record."""
+    return f"{at:%Y-%m-%d %H:%M:%S.%f}," + line(k).split(",", 1)[1]
+
+
+START = datetime(2026, 10, 25, 2, 59, 55)
+
+
+def test_a_clock_that_is_set_back_by_an_hour_is_counted_on(tmp_path):
+    stamps = [START + timedelta(seconds=0.5 * k) for k in range(20)]
+    local = [at - timedelta(hours=at.hour >= 3) for at in stamps]
+    rows = "\n".join(dated(at, k) for k, at in enumerate(local))
+    found = read_experiments(write(tmp_path / "a.csv", f"time,y,u\n{rows}"))
+    same_as_plain(tmp_path, found)
+    assert any("set back by an hour at row 11 of numbers" in note for note in found.notes)
+
+
+def test_two_recordings_of_an_hour_are_two(tmp_path):
+    rows = "\n".join(f"{5 * (k % 720)},{k // 30 % 5},{k // 90 % 2}" for k in range(1440))
+    first, second = read_csv(write(tmp_path / "a.csv", f"t (s),y,u\n{rows}"), Selection())
+    assert len(first.measurement) == len(second.measurement) == 720
+
+
+def test_a_stamp_of_a_clock_that_was_not_set_is_left_out(tmp_path):
+    rows = [dated(START + timedelta(seconds=k), k % 7) for k in range(100)]
+    rows[70] = "1970-01-01 00:00:00,3,3"
+    (log,) = read_csv(write(tmp_path / "a.csv", "time,y,u\n" + "\n".join(rows)), Selection())
+    assert len(log.measurement) == 99
+    assert np.diff(log.measurement.time_ns).max() == 2 * 10**9
+    assert any("before 1973 are left out" in n and "in line 72" in n for n in log.notes)
+
+
+def test_rows_that_stand_twice_count_once(tmp_path):
+    rows = "\n".join(line(k // 2) for k in range(40))
+    found = read_experiments(write(tmp_path / "a.csv", f"t,y,u\n{rows}"))
+    same_as_plain(tmp_path, found)
+    assert found.notes == ("20 rows stand twice, and count once",)
+
+
+@pytest.mark.parametrize("cell", ["75,5", "7,550.0", "-7,5"])
+def test_a_comma_within_a_number_between_commas_is_told(tmp_path, cell):
+    rows = "\n".join(f'{k},"{cell}",{k % 2}' for k in range(9))
+    with pytest.raises(BagError, match=r"commas separate columns.*semicolons between"):
+        read_experiments(write(tmp_path / "a.csv", f"t,y,u\n{rows}"))
+
+
+def test_two_columns_of_one_name_have_to_be_renamed(tmp_path):
+    text = "t,PV,PV,CO\n" + "\n".join(line(k).replace(",", ",1,", 1) for k in range(20))
+    with pytest.raises(SelectionError, match=r"2 columns named 'PV'.*change them in its header"):
+        read_experiments(write(tmp_path / "a.csv", text))
+
+
 def test_rows_without_times_need_their_period(tmp_path):
     cells = [line(k).split(",") for k in range(20)]
     text = "input,output\n" + "\n".join(f"{u},{y}" for _, y, u in cells)
