@@ -93,6 +93,36 @@ def test_combinations_are_told_where_parameters_are_not_determined():
     assert any("at rest" in a for a in found.advice)
 
 
+def _stepped(held: float, noise: float, process: TransferFunction) -> Record:
+    """Record three steps by hand, each held for a while, from rest."""
+    time = np.arange(0.0, 20.0 + 3.0 * held)
+    at = 20.0 + held * np.arange(3)
+    u = PiecewiseConstant(at, np.array([1.0, 0.0, 1.0]), 0.0)
+    y = response(process, time, u) + np.random.default_rng(1).normal(0.0, noise, time.size)
+    return Record(time=time, measurement=y, command=u(time), held_input=u)
+
+
+@pytest.mark.parametrize("held", [15.0, 80.0])
+def test_advice_fits_a_test_by_steps(held):
+    """Where there was no relay none is told, nor steps that last longer than those that were."""
+    process = TransferFunction.fopdt(1.0, 20.0, 6.0)
+    found = identify(_stepped(held, 0.2, process), "waveform", GIVEN)
+    assert "dead_time" in found.undetermined
+    told = " ".join(found.advice)
+    assert not any(word in told for word in ("relay", "cycle", "extra_delay", "amplitude"))
+    assert ("a step of the command held for about" in told) == (held == 15.0)
+    assert "steps 1." in told or "steps 3." in told
+
+
+def test_the_interval_of_a_dead_time_is_not_negative():
+    found = identify(
+        _stepped(40.0, 0.2, TransferFunction.fopdt(1.0, 20.0, 0.5)), "waveform", GIVEN
+    )
+    low, high = found.ci95_low[-1], found.ci95_high[-1]
+    assert found.parameters[-1] == "dead_time"
+    assert 0.0 <= low <= found.values[-1] < high
+
+
 def test_a_determined_model_needs_no_combinations():
     found = identify(_record((1.65, 20.0, 10.0), 0.05), "waveform", GIVEN)
     assert found.undetermined == ()

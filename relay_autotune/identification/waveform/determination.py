@@ -43,12 +43,14 @@ class _Tests:
     :param biased: one of them has a mean command off the baseline.
     :param rested: one of them begins with samples at rest.
     :param interval: typical time between samples [s].
+    :param held: longest time for which a command was held [s].
     :param relay: all were relay tests.
     """
 
     biased: bool
     rested: bool
     interval: float
+    held: float
     relay: bool
 
 
@@ -70,12 +72,12 @@ def advice(found: Identification, records: Sequence[Record]) -> tuple[str, ...]:
         small |= missing & {"time_constant"} if found.model.integrators else set()
     if small:
         said += _for_fast(found, sorted(small), tests)
-    said += _for_noise(found, missing)
+    said += _for_noise(found, missing, tests)
     return tuple(said)
 
 
 def _tests_of(records: Sequence[Record]) -> _Tests:
-    biased, rested = False, False
+    biased, rested, held = False, False, 0.0
     for record in records:
         u = record.input()
         settings = record.settings
@@ -85,9 +87,10 @@ def _tests_of(records: Sequence[Record]) -> _Tests:
         if changes.size:
             gap = float(np.median(np.diff(changes))) if changes.size > 1 else record.duration
             rested |= float(changes[0] - record.time[0]) >= _SHORT_REST * gap
+            held = max(held, *np.diff(np.append(changes, record.time[-1])).tolist())
     intervals = [record.mean_interval for record in records]
     relay = all(record.settings is not None for record in records)
-    return _Tests(biased, rested, max(intervals), relay)
+    return _Tests(biased, rested, max(intervals), held, relay)
 
 
 def _for_slow(found: Identification, tests: _Tests) -> list[str]:
@@ -104,7 +107,7 @@ def _for_slow(found: Identification, tests: _Tests) -> list[str]:
             "samples at rest before the first change of the command would determine the gain, "
             "since they fix the measurement's zero"
         )
-    if slowest > 0.0:
+    if 3.0 * slowest > tests.held:
         said.append(
             f"a step of the command held for about {digits(3.0 * slowest, 2)} s, three times the "
             "slowest lag, would determine gain and time constant"
@@ -122,6 +125,13 @@ def _for_fast(found: Identification, names: Sequence[str], tests: _Tests) -> lis
             f"faster sampling would help with the {text}: the dead time is {digits(fast, 2)} s, "
             f"the time between samples {digits(tests.interval, 2)} s"
         )
+    elif not tests.relay:
+        half = math.pi / found.ultimate_frequency
+        half = half if math.isfinite(half) else 2.0 * fast
+        said.append(
+            f"a few steps to and fro in the same record, each held for about {digits(half, 2)} s, "
+            f"would tell the {text} apart, since fast changes show them"
+        )
     else:
         said.append(
             f"a second, slower test with a dead time added to the relay (extra_delay of about "
@@ -130,7 +140,7 @@ def _for_fast(found: Identification, names: Sequence[str], tests: _Tests) -> lis
     return said
 
 
-def _for_noise(found: Identification, missing: set[str]) -> list[str]:
+def _for_noise(found: Identification, missing: set[str], tests: _Tests) -> list[str]:
     """Return how much larger or longer the same test would have to be."""
     # An interval is as wide as the noise over the amplitude, and narrows with the cycles.
     widest = 0.0
@@ -143,9 +153,10 @@ def _for_noise(found: Identification, missing: set[str]) -> list[str]:
             widest = max(widest, times)
     if not 1.0 < widest <= _MOST_TIMES:
         return []
+    larger, more = ("an amplitude", "cycles") if tests.relay else ("steps", "of them")
     return [
-        f"an amplitude {widest:.1f} times as large, or {math.ceil(widest**2)} times as many "
-        "cycles, would narrow every interval enough"
+        f"{larger} {widest:.1f} times as large, or {math.ceil(widest**2)} times as many {more}, "
+        "would narrow every interval enough"
     ]
 
 
@@ -174,6 +185,7 @@ def with_what_is_determined(
         for p, value, a, b in zip(parameters, found.values, low, high, strict=True)
         if not is_determined(float(value), float(a), float(b))
     )
+    low = np.maximum(low, found.estimate.structure.least)
     found = replace(found, ci95_low=low, ci95_high=high, undetermined=undetermined)
     if not undetermined:
         return found
