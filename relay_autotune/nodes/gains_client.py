@@ -391,12 +391,8 @@ class GainsClient(LoopClient):
         begun = time.monotonic()
         goal.apply = new is not None
         while not leave():
-            sent = self._verify.send_goal_async(
-                goal, feedback_callback=lambda message: tell(visible(message.feedback.status))
-            )
-            if not self.wait(sent.done, self._answers_within):
-                raise LoopError(f"{self.name} has not answered within {self._answers_within:g} s")
-            answer = self._ended(sent.result(), leave)
+            sent = self._sent(self._verify, goal, lambda found: tell(visible(found.status)))
+            answer = self._ended(sent, leave)
             result = made_visible(answer.result)
             if answer.status == GoalStatus.STATUS_SUCCEEDED:
                 return result

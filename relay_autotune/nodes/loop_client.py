@@ -13,6 +13,7 @@ from typing import Any, Self
 
 import rclpy
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
@@ -207,6 +208,23 @@ class LoopClient:
         :param request: what is asked.
         """
         return self._service(kind, service).call_async(request)
+
+    def _sent(self, action: ActionClient, goal: Any, feedback: Callable[[Any], object]) -> Any:
+        """Send a goal, and return its handle.
+
+        :param action: of this client's node.
+        :param goal: what is asked for.
+        :param feedback: takes each message of the goal's feedback.
+        :raises LoopError: if it is not answered, or rejected.
+        """
+        sent = action.send_goal_async(goal, feedback_callback=lambda m: feedback(m.feedback))
+        if not self.wait(sent.done, self._answers_within):
+            raise LoopError(
+                f"{self.name} has not answered the request within {self._answers_within:g} s"
+            )
+        if not sent.result().accepted:
+            raise LoopError(f"{self.name} has rejected the request; its log says why")
+        return sent.result()
 
     def _service(self, kind: Any, service: str) -> Any:
         if service not in self._services:

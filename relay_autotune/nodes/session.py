@@ -84,23 +84,11 @@ class Session:
         """Number of samples answered."""
         self._last = (0, 0, 0.0, 0.0)
         self._first_answer_ns = 0
-        self._repeated_ns = 0
+        self._repeats, self._repeated_ns = repeats, 0
         self.may_be_no_repeat = False
         self._received_ns = array.array("q")
         self._sent_ns = array.array("q")
         self.clocks = ClockWatch()
-        if sample_period > 0.0:
-            self.answer = self._answer_by_number
-        elif clock is not None:
-            self.answer = self._answer_by_clock
-        elif repeats:
-            self.answer = self._answer_by_arrival
-        else:
-            self.answer = self._answer_by_stamp
-
-    answer: Callable[[float, int | None, int | None], float | None]
-    """Take a measurement, when it was measured and when it arrived [ns]; None: not known. Return
-    the command, or None for no answer."""
 
     @property
     def has_news(self) -> bool:
@@ -111,6 +99,36 @@ class Session:
         if experiment.state is not self.told_state:
             return True
         return self.early is not None and self.early.is_due(experiment)
+
+    def answer(self, measurement: float, source: int | None, received: int | None) -> float | None:
+        """Take a measurement; return the command, or None for no answer.
+
+        :param measurement: [y].
+        :param source: when it was measured [ns]; None: not known.
+        :param received: when it arrived [ns]; None: not known.
+        """
+        if self._period > 0.0:
+            return self._answer_by_number(measurement, source)
+        received = received or time.time_ns()
+        if self._clock is not None:
+            source = received = self._clock()
+        elif self._repeats:
+            if 0 < self._repeated_ns - received < _LONGEST_WAIT_NS:
+                # The message waited in the queue while the value before it was repeated.
+                received = self._repeated_ns
+            source = received
+        else:
+            source = source or received
+            if self._one_clock:
+                # A simulated robot's clock may run at another pace than ours.
+                received = source
+        command = self._answer_at(received, source, measurement, self._step)
+        start = self.start_ns
+        stepped = self.clocks.add((source - start) * 1e-9, (received - start) * 1e-9)
+        if stepped is not None:
+            command = self.experiment.abort(stepped)
+            self._last = (received, source, measurement, command)
+        return command
 
     def repeat(self, measurement: float, ago: float = 0.0) -> float:
         """Take the last measurement for a sample again; return the command.
@@ -231,40 +249,11 @@ class Session:
         self._last = (received, source, measurement, command)
         return command
 
-    def _answer_by_stamp(
-        self, measurement: float, source: int | None, received: int | None
-    ) -> float:
-        received = received or time.time_ns()
-        source = source or received
-        if self._one_clock:
-            # A simulated robot's clock may run at another pace than ours.
-            received = source
-        command = self._answer_at(received, source, measurement, self._step)
-        start = self.start_ns
-        stepped = self.clocks.add((source - start) * 1e-9, (received - start) * 1e-9)
-        if stepped is not None:
-            command = self.experiment.abort(stepped)
-            self._last = (received, source, measurement, command)
-        return command
-
-    def _answer_by_arrival(self, measurement: float, _: int | None, received: int | None) -> float:
-        received = received or time.time_ns()
-        if 0 < self._repeated_ns - received < _LONGEST_WAIT_NS:
-            # The message waited in the queue while the value before it was repeated.
-            received = self._repeated_ns
-        return self._answer_at(received, received, measurement, self._step)
-
-    def _answer_by_clock(self, measurement: float, *_: int | None) -> float:
-        now = self.now_ns()
-        return self._answer_at(now, now, measurement, self._step)
-
-    def _answer_by_number(
-        self, measurement: float, source: int | None, _: int | None = None
-    ) -> float | None:
+    def _answer_by_number(self, measurement: float, source: int | None) -> float | None:
         k = self.sample_count
         if k == 0:
             self.start_ns = source or time.time_ns()
-        elif k == 1 and self._repeats(measurement, source):
+        elif k == 1 and self._is_repeat(measurement, source):
             return None
         self.sample_count = k + 1
         sampled = k * self._period
@@ -275,7 +264,7 @@ class Session:
             self._first_answer_ns = time.time_ns()
         return command
 
-    def _repeats(self, measurement: float, source: int | None) -> bool:
+    def _is_repeat(self, measurement: float, source: int | None) -> bool:
         if source is None:
             return False
         since_answer = (source - self._first_answer_ns) * 1e-9

@@ -121,17 +121,8 @@ class TuneClient(LoopClient):
         :param dry_run: whether only to check, and not to start.
         :raises LoopError: if the node does not answer.
         """
-        sent = self._client.send_goal_async(
-            Tune.Goal(amplitude=amplitude, dry_run=dry_run),
-            feedback_callback=lambda message: self._feedback.append(message.feedback),
-        )
-        if not self.wait(sent.done, self._answers_within):
-            raise LoopError(
-                f"{self.name} has not answered the request within {self._answers_within:g} s"
-            )
-        self._goal = sent.result()
-        if not self._goal.accepted:
-            raise LoopError(f"{self.name} has rejected the request; its log says why")
+        goal = Tune.Goal(amplitude=amplitude, dry_run=dry_run)
+        self._goal = self._sent(self._client, goal, self._feedback.append)
         self._answer = self._goal.get_result_async()
 
     def check(self, amplitude: float) -> Any:

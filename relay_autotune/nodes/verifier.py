@@ -22,6 +22,7 @@ from relay_autotune.control.verification import Plan, Step, compare, plan
 from relay_autotune.errors import NotReadyError, RelayAutotuneError
 from relay_autotune.exchange.fields import float64_array
 from relay_autotune.exchange.messages import fill_reason, reason_from_message, set_stamp
+from relay_autotune.experiment.settling import rest_state
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.goals import Narrator, OneGoal, conclude
@@ -400,17 +401,15 @@ class Verifier:
 
     def _at_rest(self, steps: Sequence[Step]) -> tuple[Rest, float]:
         """Return the loop's state of rest and its sample period [s]."""
-        t, y, u = (np.array(column) for column in zip(*self._recent, strict=True))
+        t, y, u = np.transpose(self._recent)
         period = float(np.median(np.diff(t)))
         if not period > 0.0:
             raise NotReadyError(Code.STEP_TIME_STANDS())
-        line = np.polyfit(t - t[0], y, 1)
-        noise = float(np.std(y - np.polyval(line, t - t[0]), ddof=2))
-        drift = abs(float(line[0])) * float(t[-1] - t[0])
+        found = rest_state(t - t[0], y, len(t))
         smallest = min((abs(s.setpoint) for s in steps if s.setpoint), default=math.inf)
-        if drift > 4.0 * noise and drift > 0.1 * smallest:
-            raise NotReadyError(Code.NOT_AT_REST(drift=drift, samples=len(self._recent)))
-        return Rest(float(y.mean()), float(u.mean()), noise), period
+        if found.drift > max(4.0 * found.noise_std, 0.1 * smallest):
+            raise NotReadyError(Code.NOT_AT_REST(drift=found.drift, samples=len(self._recent)))
+        return Rest(found.mean, float(u.mean()), found.noise_std), period
 
     # While it runs.
 
