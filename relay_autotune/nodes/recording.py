@@ -119,7 +119,7 @@ class Recording:
             if self._closed is not None and not self._missing:
                 self.close("with model and gains")
 
-    def told(self, working: bool, text: str) -> None:
+    def note_progress(self, working: bool, text: str) -> None:
         """Take a sign of life of the identifier.
 
         :param working: True if it still works on the experiment.
@@ -308,13 +308,13 @@ class Recordings:
         if (recording := self._kept.get(experiment_id)) is not None:
             recording.message(name, time_ns, message)
 
-    def told(self, experiment_id: str, working: bool, text: str) -> None:
-        """Take a sign of life of the identifier, as `Recording.told`.
+    def note_progress(self, experiment_id: str, working: bool, text: str) -> None:
+        """Take a sign of life of the identifier, as `Recording.note_progress`.
 
         :param experiment_id: the experiment that it works on, or has finished.
         """
         if (recording := self._kept.get(experiment_id)) is not None:
-            recording.told(working, text)
+            recording.note_progress(working, text)
 
     def close_all(self, why: str, timeout: float) -> None:
         """Close all recordings and wait for the newest to be finished.

@@ -76,7 +76,7 @@ class RelayNode(ServedNode):
             self._now_ns if self._simulated else time.time_ns,
             on_measurement=self._on_measurement,
             on_result=self._on_result,
-            on_status=lambda status: self._recordings.told(*said_by(status)),
+            on_status=lambda status: self._recordings.note_progress(*said_by(status)),
         )
         self._send, self._relay = self._ends.command.send, self._ends.relay.send
         self._on_setpoint = self._ends.setpoint is not None
@@ -244,8 +244,8 @@ class RelayNode(ServedNode):
         for index in range(session.published_cycles, session.experiment.cycle_count):
             self.defer(partial(self._publish_cycle, session, index))
         session.published_cycles = session.experiment.cycle_count
-        if session.experiment.state is not session.told_state:
-            session.told_state = session.experiment.state
+        if session.experiment.state is not session.published_state:
+            session.published_state = session.experiment.state
             self.defer(self._narrator.now)
         if (early := session.early) is not None and early.is_due(session.experiment):
             early.look(session.experiment)
@@ -284,7 +284,9 @@ class RelayNode(ServedNode):
             self._recordings.message(found.experiment_id, topic, now, found)
         if name == MODEL and message.final and not taken:
             # Gains without a model are no result: waiting longer brings nothing.
-            self._recordings.told(message.experiment_id, False, self._results.refusals.last)
+            self._recordings.note_progress(
+                message.experiment_id, False, self._results.refusals.last
+            )
         if running is None or not taken:
             return
         self._tell(running.experiment.status)

@@ -72,7 +72,7 @@ class Session:
         self.recording = recording
         self.start_ns = 0
         self.published_cycles = 0
-        self.told_state = State.SETTLING
+        self.published_state = State.SETTLING
         self.early: EarlyEnd | None = None
         """Ends the experiment once an interval is narrow enough; None: not used."""
         self.lost_samples = 0
@@ -96,7 +96,7 @@ class Session:
         experiment = self.experiment
         if experiment.cycle_count != self.published_cycles:
             return True
-        if experiment.state is not self.told_state:
+        if experiment.state is not self.published_state:
             return True
         return self.early is not None and self.early.is_due(experiment)
 

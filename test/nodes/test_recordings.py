@@ -69,12 +69,12 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
         assert [said_by(sign) for sign in signs] == [
             (experiment, True, ""), (experiment, True, "comparing structures"),
         ]  # fmt: skip
-        recordings.told(*said_by(signs[-1]))
+        recordings.note_progress(*said_by(signs[-1]))
         waits_for = recording.awaited(0.05)
         assert waits_for.endswith("s: comparing structures") is not complete
         # The identifier has sent all, of which the model was refused.
-        recordings.told(experiment, False, "the model was refused")
-        recordings.told(experiment, False, "")
+        recordings.note_progress(experiment, False, "the model was refused")
+        recordings.note_progress(experiment, False, "")
         for _ in range(PATIENCE):
             if closed:
                 break
@@ -110,7 +110,7 @@ def test_it_waits_as_long_as_the_identifier_gets_on(
     recording.close_with_results(10.0, closed.append)
     for stage in (*(f"stage {k}" for k in range(20)), *["the last one"] * 5):
         now[0] += 100.0
-        recordings.told("slow", True, stage)
+        recordings.note_progress("slow", True, stage)
     assert now[0] == 2500.0
     waits_for = recording.awaited(10.0)
     assert waits_for.startswith("waiting for identifier_node")
