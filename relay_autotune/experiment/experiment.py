@@ -27,10 +27,10 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.faults import (
     FrozenWatch,
-    ProportionalHold,
     SafePolicy,
     SampleCheck,
     SilenceWatch,
+    proportional_hold,
 )
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.phases import (
@@ -127,7 +127,7 @@ class RelayExperiment:
         self._facts = Facts(sign=parameters.process_gain_sign)
         self._why = NONE
         self._policy = policy
-        self._hold: ProportionalHold | None = None
+        self._hold: Callable[[float], float] | None = None
         self._frozen = FrozenWatch()
         self._silence = SilenceWatch()
         self._check = SampleCheck()
@@ -335,7 +335,7 @@ class RelayExperiment:
         if self.finished:
             return self.after_end(measurement)
         last = trace.time[-1] if trace else -math.inf
-        problem = self._check.problem(time, measurement, last, self._origin)
+        problem = self._check.problem(len(trace), time, measurement, last, self._origin)
         if problem is not None:
             return self._end(failed(problem), math.nan)
         if not trace:
@@ -365,7 +365,7 @@ class RelayExperiment:
         :param measurement: [y]; NaN: no measurement.
         """
         if self._hold is not None:
-            return self._hold.command(measurement)
+            return self._hold(measurement)
         if self.state is State.COMPLETED and not self._policy.give_back:
             return self.baseline
         return self.safe_command
@@ -405,7 +405,7 @@ class RelayExperiment:
         """End the experiment; return the command that answers a measurement [u]."""
         self.state, self._why = end.state, end.why
         if self._policy.hold and not self._policy.give_back:
-            self._hold = ProportionalHold.after(self.settings, self.cycles, self._policy.gain)
+            self._hold = proportional_hold(self.settings, self.cycles, self._policy.gain)
         return self.after_end(measurement)
 
     def _rate_limited(self, wanted: float) -> float:

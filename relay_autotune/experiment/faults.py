@@ -9,7 +9,7 @@ Each watch takes samples and returns a reason to end. The last part is the comma
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -43,14 +43,10 @@ class FrozenWatch:
     def __init__(self) -> None:
         self._last = math.nan
         self._pairs = self._equal = 0
-        self._run = 1
+        self.run = 1
+        """Number of equal samples, the last one included."""
         self._longest = 1
         self._noisy = False
-
-    @property
-    def run(self) -> int:
-        """Number of equal samples, the last one included."""
-        return self._run
 
     def add(self, measurement: float, *, at_rest: bool, in_cycles: bool) -> bool:
         """Take a sample; return True if the sensor is frozen.
@@ -66,16 +62,16 @@ class FrozenWatch:
             self._equal += same
         if not same:
             if not at_rest:
-                self._longest = max(self._longest, self._run)
-            self._run = 1
+                self._longest = max(self._longest, self.run)
+            self.run = 1
             self._noisy = (
                 self._pairs > _FROZEN_SAMPLES and self._equal < _RARELY_EQUAL * self._pairs
             )
             return False
-        self._run += 1
+        self.run += 1
         if self._noisy:
-            return self._run > _FROZEN_SAMPLES
-        return in_cycles and self._run > _FROZEN_SAMPLES + _FROZEN_RATIO * self._longest
+            return self.run > _FROZEN_SAMPLES
+        return in_cycles and self.run > _FROZEN_SAMPLES + _FROZEN_RATIO * self._longest
 
 
 class ClockWatch:
@@ -136,21 +132,19 @@ class SampleCheck:
     """Recognise numbers that are no measurements, and times that do not advance."""
 
     def __init__(self) -> None:
-        self._samples = 0
         self._repeats = 0
 
     def problem(
-        self, time: float, measurement: float, last: float, origin: float
+        self, count: int, time: float, measurement: float, last: float, origin: float
     ) -> Reason | None:
         """Take a sample; return why it cannot be used, None if it can.
 
+        :param count: number of samples before.
         :param time: its instant [s].
         :param measurement: [y].
         :param last: instant of the previous sample, from the first one [s]; -inf: there is none.
         :param origin: instant of the first sample [s].
         """
-        count = self._samples
-        self._samples += 1
         if not -_LARGEST < measurement < _LARGEST:
             return Code.BAD_MEASUREMENT(samples=count, value=measurement)
         if not -_LARGEST < time < _LARGEST:
@@ -439,54 +433,37 @@ class SafePolicy:
     give_back: bool = False
 
 
-@dataclass(frozen=True)
-class ProportionalHold:
-    r"""Proportional control about the set-point, ``u = u0 + k (r - y)``, within limits.
+def proportional_hold(
+    settings: RelaySettings | None, cycles: Sequence[Cycle], gain: float
+) -> Callable[[float], float] | None:
+    r"""Return proportional control about the set-point, ``u = u0 + k (r - y)``, within limits.
 
     k is half of the describing function's ultimate gain ``4 mu/(pi a)``, where a is half the
     swing of the measurement, with the sign of the process; u0 is the mean command of the last
     cycle, which balanced the process.
 
-    :param centre: u0 [u].
-    :param gain: k [u/y].
-    :param setpoint: r [y].
-    :param low: lowest command [u].
-    :param high: highest command [u].
+    :param settings: the relay's settings; its levels are the limits.
+    :param cycles: the cycles so far.
+    :param gain: a gain that the user gave [u/y]; 0: none.
+    :return: the command [u] for a measurement [y]: u0 if that is not finite. None: k is not known.
     """
+    if settings is None:
+        return None
+    centre = settings.baseline
+    if cycles:
+        last = cycles[-1]
+        centre = last.mean_command
+        half_swing = 0.5 * (last.peak_max - last.peak_min)
+        if gain == 0.0 and half_swing > 0.0:
+            gain = HOLD_SHARE * 4.0 * settings.amplitude / (math.pi * half_swing)
+            gain = -gain if settings.reverse_acting else gain
+    if gain == 0.0:
+        return None
 
-    centre: float
-    gain: float
-    setpoint: float
-    low: float
-    high: float
-
-    @classmethod
-    def after(
-        cls, settings: RelaySettings | None, cycles: Sequence[Cycle], gain: float = 0.0
-    ) -> ProportionalHold | None:
-        """Return the hold for an experiment, None if no gain is known.
-
-        :param settings: the relay's settings; its levels are the limits.
-        :param cycles: the cycles so far.
-        :param gain: a gain that the user gave [u/y]; 0: none.
-        """
-        if settings is None:
-            return None
-        centre = settings.baseline
-        if cycles:
-            last = cycles[-1]
-            centre = last.mean_command
-            half_swing = 0.5 * (last.peak_max - last.peak_min)
-            if gain == 0.0 and half_swing > 0.0:
-                gain = HOLD_SHARE * 4.0 * settings.amplitude / (math.pi * half_swing)
-                gain = -gain if settings.reverse_acting else gain
-        if gain == 0.0:
-            return None
-        return cls(centre, gain, settings.setpoint, settings.low, settings.high)
-
-    def command(self, measurement: float) -> float:
-        """Return the command [u] for a measurement [y]; the centre if it is not finite."""
+    def command(measurement: float) -> float:
         if not math.isfinite(measurement):
-            return self.centre
-        wanted = self.centre + self.gain * (self.setpoint - measurement)
-        return min(max(wanted, self.low), self.high)
+            return centre
+        wanted = centre + gain * (settings.setpoint - measurement)
+        return min(max(wanted, settings.low), settings.high)
+
+    return command

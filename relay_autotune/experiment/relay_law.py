@@ -66,41 +66,6 @@ class Relay:
         return True
 
 
-class DwellLimit:
-    """How long a relay may stay at one level before the measurement counts as lost.
-
-    The limit is :data:`RATIO` times the longest stay so far, or times the time to respond if that
-    is longer. A biased relay gets more time, in proportion to the ratio of its two steps. The
-    limit is at least :data:`LEAST_SAMPLES` samples: without noise, the response of a high-order
-    process is seen at the first sample, and takes hundreds of samples to turn.
-
-    :param balance: ratio of the smaller to the larger step of the relay, > 0.
-    """
-
-    RATIO = 10.0
-    LEAST_SAMPLES = 200
-
-    def __init__(self, balance: float) -> None:
-        self._longest = 0.0
-        self._ratio = self.RATIO / balance
-        self.limit = math.inf
-        """Limit of the present stay [s]."""
-
-    def forget(self, longest: float) -> None:
-        """Replace the longest stay so far [s]."""
-        self._longest = longest
-
-    def learn(self, stay: float, interval: float) -> None:
-        """Set the limit of the new stay from the stay that has ended.
-
-        :param stay: length of the ended stay, or at the beginning the time that the process took
-            to respond to the kick [s].
-        :param interval: mean sample interval [s].
-        """
-        self._longest = max(self._longest, stay)
-        self.limit = max(self._ratio * self._longest, self.LEAST_SAMPLES * interval)
-
-
 # A stay at the low level is noise at a switch, and begins no cycle, if it is shorter than this
 # part of the longest stay (less for a biased relay, in proportion to the ratio of its steps), or
 # of half the time that the process took to respond.

@@ -28,7 +28,6 @@ from relay_autotune.experiment.phases import Answer, Ended, Facts, Setup, State,
 from relay_autotune.experiment.relay_law import (
     MOST_COMPENSATED,
     DwellFilter,
-    DwellLimit,
     LoadCompensation,
     Relay,
     ample_swing,
@@ -47,7 +46,12 @@ _FOLLOWS = 2
 # Ratio of a cycle to the one before beyond which it is no sign of a load yet.
 _ALONE = 4.0
 
-# Part of the limit of a stay that applies after the first whole cycle.
+# The relay may stay at one level this many times as long as in the longest stay so far, or as the
+# process took to respond if that is longer, before the measurement counts as lost. A biased relay
+# gets more time, in proportion to the ratio of its two steps. The limit is at least a number of
+# samples: without noise, the response of a high-order process is seen at the first sample, and
+# takes hundreds of samples to turn. After the first whole cycle, a part of the limit applies.
+_LONGER, _LEAST_SAMPLES = 10.0, 200
 _LIMIT_IN_CYCLES = 0.4
 
 # The measurement has run away if its distance is this many times the oscillation's, for this many
@@ -167,7 +171,10 @@ class _Course:
         self.fast = _FastWatch(switches)
         floor = max(facts.hysteresis, abs(y - facts.setpoint), 3.0 * facts.rest.noise_std)
         self.runaway = RunawayWatch(floor)
-        self.dwell = DwellLimit(setup.levels.balance)
+        self.longest = 0.0
+        """The longest stay, or the time to respond if that is longer [s]."""
+        self.ratio = _LONGER / setup.levels.balance
+        """How many times as long the next stay may be."""
         self.stays = DwellFilter(t, facts.response_time)
         self.answers = False
         """True if the last stay can be a response of the process."""
@@ -293,11 +300,12 @@ class Switching:
 
     def _learn(self, stay: float) -> None:
         """Set the limit of the next stay from one that has ended [s]."""
-        p, interval = self._setup.parameters, self._setup.trace.interval
-        self._course.dwell.learn(stay, interval)
-        limit = self._course.dwell.limit
+        p, course = self._setup.parameters, self._course
+        course.longest = max(course.longest, stay)
+        least = _LEAST_SAMPLES * self._setup.trace.interval
+        limit = max(course.ratio * course.longest, least)
         if self.cycles:
-            limit = max(_LIMIT_IN_CYCLES * limit, DwellLimit.LEAST_SAMPLES * interval)
+            limit = max(_LIMIT_IN_CYCLES * limit, least)
         self._limit = p.max_half_cycle or limit + 2.0 * p.extra_delay
         self._longest_limit = max(self._longest_limit, self._limit)
 
@@ -338,7 +346,7 @@ class Switching:
         if len(self.cycles) + course.stays.lost >= most:
             lost = course.stays.lost_for
             return failed(Code.NO_CLEAR_CYCLE(time=lost, cycles=len(self.cycles), most=most))
-        course.dwell.forget(course.stays.longest)
+        course.longest = course.stays.longest
         course.is_lost = True
         return None
 
