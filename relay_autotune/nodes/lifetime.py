@@ -64,24 +64,19 @@ _NOTHING_MORE = 0.02
 
 
 class Executor(SingleThreadedExecutor):
-    """rclpy's single-threaded executor, one callback at a time, with a favoured subscription."""
+    """rclpy's single-threaded executor, one callback at a time, with a favoured subscription.
 
-    def __init__(self) -> None:
+    :param node: the only one.
+    """
+
+    def __init__(self, node: ServedNode) -> None:
         super().__init__()
-        self._favoured: Subscription | None = None
-        self._wait_set: Any = None
-        self._flowing = False
-        self._look_around_at = 0.0
-
-    def favour(self, subscription: Subscription) -> None:
-        """Give the messages of a subscription the fast path.
-
-        :param subscription: one whose callback takes the message and the middleware's facts, and
-            does not rely on what other callbacks do in between, such as that of /clock.
-        """
+        self.add_node(node)
+        self._node = node
         with self.context.handle:
             self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, self.context.handle)
-        self._favoured = subscription
+        self._flowing = False
+        self._look_around_at = 0.0
 
     def turn(self, timeout_sec: float | None) -> bool:
         """Wait for a callback and run it; return False if none became ready.
@@ -110,7 +105,7 @@ class Executor(SingleThreadedExecutor):
             pass
 
     def _take_favoured(self, timeout_sec: float) -> bool:
-        subscription = self._favoured
+        subscription = self._node.favoured
         assert subscription is not None
         handle = subscription.handle
         with handle:
@@ -135,7 +130,7 @@ class Executor(SingleThreadedExecutor):
         if error is not None:
             raise error
         # A task has no entity, and a node may have no favoured subscription.
-        if entity is not None and entity is self._favoured:
+        if entity is not None and entity is self._node.favoured:
             self._flowing = True
         return True
 
@@ -190,26 +185,23 @@ class ServedNode(Node):
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
-        self._deferred: deque[Callable[[], None]] = deque()
+        self._deferred: deque[Callable[[], object]] = deque()
         self.favoured: Subscription | None = None
-        """The subscription with the fast path, see `Executor.favour`."""
-        self._when_idle: deque[Callable[[], None]] = deque()
+        """The subscription whose messages have the fast path.
+
+        Its callback takes the message and the middleware's facts, and does not rely on what other
+        callbacks do in between, such as that of /clock."""
+        self._when_idle: deque[Callable[[], object]] = deque()
 
     def get_logger(self) -> Any:
         """Return the log, in which text of other nodes is made visible."""
         return _Log(super().get_logger())
 
-    def favour(self, subscription: Subscription) -> None:
-        """Give the messages of a subscription the fast path, see `Executor.favour`."""
-        self.favoured = subscription
-        if self.executor is not None:
-            self.executor.favour(subscription)
-
-    def defer(self, work: Callable[[], None]) -> None:
+    def defer(self, work: Callable[[], object]) -> None:
         """Do ``work`` after the present callback, in the order of the calls."""
         self._deferred.append(work)
 
-    def defer_until_idle(self, work: Callable[[], None]) -> None:
+    def defer_until_idle(self, work: Callable[[], object]) -> None:
         """Do ``work`` once no message, timer or request waits."""
         self._when_idle.append(work)
 
@@ -219,7 +211,7 @@ class ServedNode(Node):
         Full collections are far apart here, so that none falls into a running experiment; objects
         that refer to each other would pile up from one experiment to the next.
         """
-        self.defer_until_idle(_tidy)
+        self.defer_until_idle(gc.collect)
 
     def work(self, *, idle: bool) -> bool:
         """Do one piece of deferred work; return True if there is more.
@@ -435,15 +427,8 @@ def _help(name: str, purpose: str, parameters: Sequence[Quantity]) -> str:
     return "\n".join(lines)
 
 
-def _tidy() -> None:
-    gc.collect()
-
-
 def _serve(node: ServedNode, signals: _Signals) -> int:
-    executor = Executor()
-    executor.add_node(node)
-    if node.favoured is not None:
-        executor.favour(node.favoured)
+    executor = Executor(node)
     signals.wake(executor)
     # Imported objects stay for ever, so keep the garbage collector away from them.
     gc.collect()

@@ -94,6 +94,14 @@ MESSAGE_PARAMETERS = (
         "'{data: [0.0, 1.5]}'; empty: zeros."
     ),
 )
+MEASUREMENT_PARAMETERS = (
+    Quantity("measurement_type", FLOAT64).means(
+        "Message type of the measurement; its header's stamp, if it has one, is the time."
+    ),
+    Quantity("measurement_field", "data").means(
+        "Path of the measurement in it, such as velocity[left_wheel]."
+    ),
+)
 FIXED_PARAMETERS = (
     Quantity("initial_command", math.nan, "u").means(
         "Answer to each measurement before the first tune; NaN: silent until then."
@@ -106,12 +114,7 @@ FIXED_PARAMETERS = (
         "command: the relay commands the actuator; setpoint: it publishes setpoint, and the "
         "present loop stays closed, its controller connected by controller_command."
     ),
-    Quantity("measurement_type", FLOAT64).means(
-        "Message type of the measurement; its header's stamp, if it has one, is the time."
-    ),
-    Quantity("measurement_field", "data").means(
-        "Path of the measurement in it, such as velocity[left_wheel]."
-    ),
+    *MEASUREMENT_PARAMETERS,
     Quantity("repeat_period", 0.0, "s", 0.0).means(
         "For a sensor that publishes only on change: after this time of silence the last value "
         "counts as a new sample, and measurement_timeout does not apply; 0: silence is a fault."
@@ -201,10 +204,7 @@ FIXED = (
     Quantity("sample_period", 0.0, "s", 0.0).means(
         "Period of the samples where they carry no time; 0: stamps."
     ),
-    Quantity("measurement_type", FLOAT64).means(
-        "Message type of the measurement, as in relay_node."
-    ),
-    Quantity("measurement_field", "data").means("Path of the measurement in it."),
+    *MEASUREMENT_PARAMETERS,
     Quantity("repeat_period", 0.0, "s", 0.0).means(
         "For a sensor that publishes only on change: after this time of silence the last value "
         "counts as a new sample; 0: no repetition."

@@ -234,7 +234,7 @@ class Following:
             self._node, self._reader.kind, "measurement", self._take, profile, **options
         )
         if self._favours:
-            self._node.favour(found)
+            self._node.favoured = found
         return found
 
     def look(self) -> None:

@@ -40,8 +40,7 @@ def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[IdentifierNode]:
     with free_domain() as domain:
         rclpy.init(domain_id=domain)
         made = IdentifierNode()
-        executor = Executor()
-        executor.add_node(made)
+        executor = Executor(made)
         yield made
         executor.shutdown(timeout_sec=0.0)
         made.destroy_node()
