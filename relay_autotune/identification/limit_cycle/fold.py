@@ -296,6 +296,16 @@ class Fold:
         swing = self.settings.high - self.settings.low
         return answer / (swing * (1.0 - np.exp(-1j * w * self.period_high)) / (1j * w))
 
+    @property
+    def switching(self) -> tuple[float, float]:
+        """Middle and half distance of the levels at which the relay was seen to switch [y].
+
+        The latter is negative where noise put them in the order in which no relay switches.
+        """
+        at_high, at_low = (float(v) for v in self(np.array([0.0, self.period_high])))
+        side = -1.0 if self.settings.reverse_acting else 1.0
+        return 0.5 * (at_high + at_low), 0.5 * (at_low - at_high) * side
+
     def _value(self, time: FloatArray, derivative: int) -> FloatArray:
         unit = self.period_high if self.mirrored else self.period
         columns = Basis(self.mirrored, self.period_high / unit)
@@ -441,22 +451,9 @@ def as_switched(seen: Fold) -> RelaySettings:
 
     :param seen: the averaged period.
     """
-    middle = 0.5 * float(np.sum(seen(np.array([0.0, seen.period_high]))))
-    return replace(
-        seen.settings,
-        setpoint=seen.settings.setpoint + middle,
-        hysteresis=max(level_at_switch(seen), 0.0),
-    )
-
-
-def level_at_switch(seen: Fold) -> float:
-    """Return half the distance of the levels at which the relay was seen to switch [y].
-
-    :param seen: the averaged period.
-    :return: negative where noise put them in the order in which no relay switches.
-    """
-    at_high, at_low = (float(v) for v in seen(np.array([0.0, seen.period_high])))
-    return 0.5 * (at_low - at_high) * (-1.0 if seen.settings.reverse_acting else 1.0)
+    middle, level = seen.switching
+    setpoint = seen.settings.setpoint + middle
+    return replace(seen.settings, setpoint=setpoint, hysteresis=max(level, 0.0))
 
 
 def _overlaid(

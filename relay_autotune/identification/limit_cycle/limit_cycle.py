@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,7 +15,13 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
-from relay_autotune.identification.limit_cycle.fold import NO_BIAS, SYMMETRIC, switched_at
+from relay_autotune.identification.limit_cycle.fold import (
+    NO_BIAS,
+    SYMMETRIC,
+    Fold,
+    Reading,
+    switched_at,
+)
 from relay_autotune.record.cycles import (
     LimitCycle,
     cycles_of,
@@ -29,6 +36,8 @@ from relay_autotune.record.record import PiecewiseConstant, Record, RelaySetting
 _OFF_LEVEL = 0.05
 _MOST_BETWEEN = 0.01
 _LEAST_SAMPLES = 4
+# Largest level at a switch, over the amplitude.
+MOST_LEVEL = 0.99
 
 NOT_SETTLED = "the limit cycle had not settled: its last cycles still differ"
 
@@ -83,6 +92,23 @@ class RelayTest:
                 "has the wrong sign"
             )
         return abs(known.gain)
+
+    def read(self, more: Callable[[Fold, float], float]) -> Reading:
+        """Return period, amplitude, level at the switch, and one number more.
+
+        :param more: from the averaged period and its amplitude to the number.
+        """
+
+        def measure(seen: Fold) -> FloatArray:
+            low, high = seen.peaks()
+            amplitude = 0.5 * (high - low)
+            return np.array((seen.period, amplitude, seen.switching[1], more(seen, amplitude)))
+
+        found = Reading.of(self.record, self.cycle.cycles, measure)
+        # In noise the level may be below zero, where no relay switches; its scatter is to both
+        # sides.
+        found.values[2] = min(max(found.values[2], 0.0), MOST_LEVEL * found.values[1])
+        return found
 
     def remarks(self, *, symmetric: bool = True) -> list[str]:
         """Return sentences on what the equations of a limit cycle take for granted.
@@ -170,6 +196,12 @@ class SymmetricCycle:
     relay: float
     level: float
     dead_time: float
+
+    @classmethod
+    def of(cls, test: RelayTest, read: Reading) -> SymmetricCycle:
+        """Return what :meth:`RelayTest.read` has read, with a dead time as the last number."""
+        period, amplitude, level, dead_time = read.values.tolist()
+        return cls(period, amplitude, test.settings.amplitude, level, dead_time)
 
     @property
     def frequency(self) -> float:

@@ -65,19 +65,17 @@ def envelope(record: Record) -> Envelope:
         )
     moved = np.flatnonzero(record.command != settings.baseline)
     begin = float(record.time[moved[0]]) if moved.size else float(record.time[0])
-    times, heights = [], []
+    peaks = []
     for cycle in cycles:
-        low_at = cycle.start + cycle.period_high
+        ends = [
+            (cycle.time_to_peak_min, settings.setpoint - cycle.peak_min),
+            (cycle.time_to_peak_max, cycle.peak_max - settings.setpoint),
+        ]
         # With a positive gain the high level turns the measurement up, so that it ends a minimum.
-        high_turns, low_turns = (
-            (cycle.time_to_peak_max, cycle.time_to_peak_min)
-            if settings.reverse_acting
-            else (cycle.time_to_peak_min, cycle.time_to_peak_max)
-        )
-        down, up = settings.setpoint - cycle.peak_min, cycle.peak_max - settings.setpoint
-        times += [cycle.start + high_turns - begin, low_at + low_turns - begin]
-        heights += [up, down] if settings.reverse_acting else [down, up]
-    return Envelope(np.array(times), np.array(heights))
+        after_high, after_low = ends[::-1] if settings.reverse_acting else ends
+        for switch, (late, height) in ((0.0, after_high), (cycle.period_high, after_low)):
+            peaks.append((cycle.start + switch + late - begin, height))
+    return Envelope(*np.array(peaks).T)
 
 
 def growth_time(peaks: Envelope, noise_std: float = 0.0) -> float:

@@ -32,8 +32,9 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.experiment.settling import NOT_SETTLED, ResponseDetector
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.limit_cycle.fold import Fold, Reading, fold, level_at_switch
+from relay_autotune.identification.limit_cycle.fold import Fold, Reading, fold
 from relay_autotune.identification.limit_cycle.limit_cycle import (
+    MOST_LEVEL,
     RelayTest,
     SymmetricCycle,
     relay_test,
@@ -143,8 +144,6 @@ _MOST_EQUAL = 20
 _ALIKE = 1.02
 _ALIKE_SHARE = 3e-3
 _SHAPE_POINTS = 200
-# Largest level at a switch, over the amplitude.
-_MOST_LEVEL = 0.99
 
 # Gain and time constants.
 Solution = tuple[float, ...]
@@ -173,22 +172,6 @@ CHANG = SymmetricMethod("chang", EXACT, 0.05, "eqs 8 to 12 and 21 to 25", MIXED)
 ATV = SymmetricMethod("atv", FIRST, 0.1, "eqs 6, 7, 13 and 21 to 25", FIRST)
 
 
-def symmetric_reading(test: RelayTest) -> Reading:
-    """Return period, amplitude and level at the switch of an unbiased relay test, and a zero.
-
-    :param test: the relay test.
-    """
-
-    def measure(seen: Fold) -> FloatArray:
-        low, high = seen.peaks()
-        return np.array((seen.period, 0.5 * (high - low), level_at_switch(seen), 0.0))
-
-    read = Reading.of(test.record, test.cycle.cycles, measure)
-    # In noise the level may be below zero, where no relay switches.
-    read.values[2] = min(max(read.values[2], 0.0), _MOST_LEVEL * read.values[1])
-    return read
-
-
 @dataclass(frozen=True)
 class LagProblem:
     """Lags that are sought for a limit cycle.
@@ -211,7 +194,7 @@ class LagProblem:
         """Return the limit cycle of some numbers."""
         period, amplitude, height, dead_time = numbers.tolist()
         # The scatter about zero is that of the reading, to both sides.
-        level = height if self.test is None else min(height, _MOST_LEVEL * amplitude)
+        level = height if self.test is None else min(height, MOST_LEVEL * amplitude)
         return SymmetricCycle(period, amplitude, self.relay, level, max(dead_time, 0.0))
 
     @property
@@ -356,7 +339,8 @@ def _from_record(
     test.require_unbiased()
     gain, settings = test.known_gain(known), test.settings
     dead_time, std, source = read_dead_time(test, known)
-    reading = symmetric_reading(test).with_number(3, dead_time + settings.extra_delay, std)
+    late = dead_time + settings.extra_delay
+    reading = test.read(lambda *_: late).with_number(3, late, std)
     problem = LagProblem(method, reading, settings.amplitude, gain, test)
     return _identified(problem, known, source, ideal=settings.hysteresis == 0.0)
 

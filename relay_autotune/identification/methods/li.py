@@ -36,7 +36,7 @@ from relay_autotune.identification.limit_cycle.limit_cycle import (
     SymmetricCycle,
     relay_test,
 )
-from relay_autotune.identification.methods.chang import alike, shape_misfit, symmetric_reading
+from relay_autotune.identification.methods.chang import alike, shape_misfit
 from relay_autotune.identification.methods.lags import (
     MODEL_1,
     MODEL_4,
@@ -276,8 +276,8 @@ def identify_li_jointly(records: Sequence[Record], known: Known = NOTHING) -> Id
             "one of the tests had a reverse-acting relay and another did not: they are not of "
             "one process"
         )
-    readings = [symmetric_reading(test) for test in tests]
-    cycles = [_cycle(*pair) for pair in zip(tests, readings, strict=True)]
+    readings = [test.read(lambda *_, test=test: test.settings.extra_delay) for test in tests]
+    cycles = [SymmetricCycle.of(*pair) for pair in zip(tests, readings, strict=True)]
     require_difference(cycles)
     errors = [_errors(test, read) for test, read in zip(tests, readings, strict=True)]
     candidates = fits_jointly(cycles, known, errors, tests[0].sign)
@@ -318,13 +318,6 @@ def _shape_misfit(
     delayed = [replace(cycle, dead_time=dead_time + cycle.dead_time) for cycle in cycles]
     pairs = zip(tests, delayed, strict=True)
     return math.hypot(*(shape_misfit(t, fit.model, c, (gain, *constants)) for t, c in pairs))
-
-
-def _cycle(test: RelayTest, read: Reading) -> SymmetricCycle:
-    """Return the limit cycle of a test, with the dead time that its relay added."""
-    period, amplitude, height, _ = read.values.tolist()
-    settings = test.settings
-    return SymmetricCycle(period, amplitude, settings.amplitude, height, settings.extra_delay)
 
 
 def _errors(test: RelayTest, read: Reading) -> tuple[float, float]:

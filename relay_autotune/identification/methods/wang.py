@@ -43,7 +43,7 @@ from scipy.special import ndtr
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.limit_cycle.fold import Fold, Reading, level_at_switch
+from relay_autotune.identification.limit_cycle.fold import Fold, Reading
 from relay_autotune.identification.limit_cycle.fourier import (
     UNKNOWN_REST,
     StaticGain,
@@ -330,25 +330,21 @@ def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
         )
 
     def equations(numbers: FloatArray) -> Fopdt:
-        high, low, down, up, at_high, at_low, measured, error = numbers.tolist()
+        high, low, down, up, about, epsilon, measured, error = numbers.tolist()
         # A steady state that is a little higher makes the gain lower; with the command turned
         # round a reverse-acting process has a positive gain.
         k = sign * (measured - error / gain.excursion)
-        about = 0.5 * (at_high + at_low)
         bias = sign * settings.bias - (settings.setpoint + about - rest.value - error) / k
-        high, low = (high, low)[::sign]
         cycle = FopdtCycle(high, low, up - about, down - about)
-        epsilon = 0.5 * sign * (at_low - at_high)
         return fopdt_from_biased(cycle, k, settings.amplitude, bias, epsilon)
 
     def measure(seen: Fold) -> FloatArray:
-        at = seen(np.array([0.0, seen.period_high]))
-        return np.array((seen.period_high, seen.period_low, *seen.peaks(), *at, gain.value, 0.0))
+        halves = (seen.period_high, seen.period_low)[::sign]
+        return np.array((*halves, *seen.peaks(), *seen.switching, gain.value, 0.0))
 
     reading = Reading.of(record, test.cycle.cycles, measure)
-    if sign * (reading.values[5] - reading.values[4]) < 0.0:
-        # Noise put the levels in the order in which no relay switches.
-        reading.values[4:6] = np.mean(reading.values[4:6])
+    # Noise may put the levels in the order in which no relay switches.
+    reading.values[5] = max(reading.values[5], 0.0)
     reading = reading.with_number(6, gain.value, gain.scatter)
     reading = reading.with_number(7, 0.0, rest.std if rest.measured else 0.0)
     return solved(
@@ -380,15 +376,10 @@ def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
             return fopdt_from_unbiased(period, amplitude, response, mu, epsilon)
         return fopdt_with_gain(gain, period, amplitude, mu, epsilon)
 
-    def measure(seen: Fold) -> FloatArray:
-        down, up = seen.peaks()
-        amplitude = 0.5 * (up - down)
-        ratio = amplitude / (mu * abs(seen.fundamental())) if math.isnan(gain) else 1.0
-        return np.array((seen.period, amplitude, level_at_switch(seen), ratio))
+    def over_fundamental(seen: Fold, amplitude: float) -> float:
+        return amplitude / (mu * abs(seen.fundamental())) if math.isnan(gain) else 1.0
 
-    reading = Reading.of(record, test.cycle.cycles, measure)
-    # Noise may put it below zero, where no relay switches; the scatter is to both sides.
-    reading.values[2] = max(reading.values[2], 0.0)
+    reading = test.read(over_fundamental)
     remark, ratio = "", float(reading.values[3])
     if math.isnan(gain) and reading.covariance is not None:
         likely, std = _likely_ratio(ratio, float(reading.std[3]))
