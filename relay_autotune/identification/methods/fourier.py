@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from scipy.optimize import brentq
@@ -184,73 +184,64 @@ def identify_fourier(record: Record, known: Known = NOTHING) -> Identification:
         known = replace(known, order=known.order or 2)
     structure = structure_asked_for(METHOD, known, _STRUCTURES) or FOPDT
     test = relay_test(METHOD, record, two_levels=False)
-    sign = test.sign
     test.known_gain(known)
     harmonics = measured_points(test)
-    points = _with_static_gain(test, record, harmonics, structure)
-    fit = _fit(structure, known, sign, points)
+    points = _with_static_gain(test, harmonics, structure)
+    fit = _fit(structure, known, test.sign, points)
     cost, values = _nearest(fit, points)
-    x = fit.searched(values)
     if not structure.unstable:
         harmonics = with_noise_about(structure.build(values), test, harmonics)
-        points = _with_static_gain(test, record, harmonics, structure)
-        fit = _fit(structure, known, sign, points)
+        points = _with_static_gain(test, harmonics, structure)
+        fit = _fit(structure, known, test.sign, points)
         cost, x = fit.best((values,))
-    values = fit.values(x)
+        values = fit.values(x)
     remarks = test.remarks(symmetric=False)
     freedom = points.numbers - fit.free.size
     # The standard deviations are estimates with few degrees of freedom.
-    told = max(4 * (len(test.cycle.cycles) - 1), 1)
-    unlikely = freedom > 0 and fdtrc(freedom, told, cost / freedom) < _UNLIKELY
+    estimated = max(4 * (len(test.cycle.cycles) - 1), 1)
+    unlikely = freedom > 0 and fdtrc(freedom, estimated, cost / freedom) < _UNLIKELY
     if unlikely:
         remarks.append(
             f"the points lie {math.sqrt(cost / freedom):.2g} times as far from the model as their "
             "noise allows: the process is of another structure; K_u and w_u are those of the "
             "points"
         )
-    between = smooth if unlikely else interpolated
-    covariance, ultimate_std = _uncertainty(fit, points, x, between)
-    covariance = covariance * (cost / freedom if unlikely else 1.0)
-    found = identified(METHOD, Estimate.of(structure, values, covariance))
-    point = between(found.model, points.frequency, points.value)
-    if point is None:
+    (gain, frequency), covariance = _with_ultimate_point(
+        fit, points, fit.searched(values), smooth if unlikely else interpolated
+    )
+    low, high = harmonics[0].frequency / _BEYOND, harmonics[-1].frequency * _BEYOND
+    if math.isnan(gain):
         remarks.append("the points do not tell where the phase is -180 degrees")
-    elif not _covered(point.frequency, harmonics):
+    elif not low <= frequency <= high:
         remarks.append(
             f"the ultimate frequency lies outside the points, which begin at "
             f"{harmonics[0].frequency:.4g} rad/s: K_u and w_u depend on the structure of the model"
         )
+    wider = cost / freedom if unlikely else 1.0
+    found = identified(METHOD, Estimate.of(structure, values, covariance[:-2, :-2] * wider))
+    gain_std, frequency_std = np.sqrt(np.diag(covariance)[-2:]).tolist()
     return replace(
         found,
-        ultimate_gain=math.nan if point is None else point.gain,
-        ultimate_gain_std=ultimate_std[0],
-        ultimate_frequency=math.nan if point is None else point.frequency,
-        ultimate_frequency_std=ultimate_std[1],
+        ultimate_gain=gain,
+        ultimate_gain_std=gain_std,
+        ultimate_frequency=frequency,
+        ultimate_frequency_std=frequency_std,
         warnings=(*found.warnings, *remarks),
         points=harmonics,
     )
 
 
-def _covered(frequency: float, points: tuple[FrequencyPoint, ...]) -> bool:
-    low, high = points[0].frequency, points[-1].frequency
-    return low / _BEYOND <= frequency <= high * _BEYOND
-
-
 def _with_static_gain(
-    test: RelayTest, record: Record, points: tuple[FrequencyPoint, ...], structure: Structure
+    test: RelayTest, points: tuple[FrequencyPoint, ...], structure: Structure
 ) -> _Points:
     """Add the static gain as a point at w = 0, where the means show it and the model has one."""
-    rest = steady_state(record, test.settings)
+    rest = steady_state(test.record, test.settings)
     if not structure.integrators and rest.measured:
         # The mean command of an unbiased relay is the baseline.
         with suppress(IdentificationError):
             gain = static_gain(test, rest)
             points = (FrequencyPoint(0.0, complex(gain.value), gain.std(rest)), *points)
-    return _Points(
-        np.array([p.frequency for p in points]),
-        np.array([p.value for p in points]),
-        np.array([p.std for p in points]),
-    )
+    return _Points(*(np.array(x) for x in zip(*map(astuple, points), strict=True)))
 
 
 def _fit(structure: Structure, known: Known, sign: int, points: _Points) -> Fit:
@@ -261,8 +252,7 @@ def _fit(structure: Structure, known: Known, sign: int, points: _Points) -> Fit:
         away = (model(1j * points.frequency) - points.value) / points.std
         return np.concatenate((away.real, away.imag[points.frequency > 0.0]))
 
-    facts = {"gain": known.gain, "dead_time": known.dead_time}
-    given = np.array([facts.get(n, math.nan) for n in structure.names])
+    given = np.array([getattr(known, name, math.nan) for name in structure.names])
     # A radian at the lowest frequency.
     unit = 1.0 / float(points.frequency[points.frequency > 0.0][0])
     return Fit(structure, given, sign, residual, unit)
@@ -288,13 +278,13 @@ def _nearest(fit: Fit, points: _Points) -> tuple[float, FloatArray]:
     return cost, values
 
 
-def _uncertainty(
+def _with_ultimate_point(
     fit: Fit, points: _Points, x: FloatArray, between: Interpolation
-) -> tuple[FloatArray, tuple[float, float]]:
-    """Return the covariance of the values, and the deviations of K_u and w_u.
+) -> tuple[tuple[float, float], FloatArray]:
+    """Return K_u and w_u, and the covariance of the model's values and these two.
 
     Each measured number is moved by a share of its deviation; the least of the sum of squares
-    then lies one Newton step away. With fewer numbers than values the covariance is NaN.
+    then lies one Newton step away. With fewer numbers than values the covariance of these is NaN.
 
     :param fit: the least squares.
     :param points: what was measured.
@@ -317,9 +307,10 @@ def _uncertainty(
         return np.append(there, ultimate)
 
     none = np.zeros(place.size)
+    gain, frequency = answer(none)[-2:].tolist()
     spread = jacobian(answer, none, none + _STEP)
     squares = spread @ spread.T
     if place.size < fit.free.size:
         # A single point does not determine three values.
         squares[:-2, :-2] = math.nan
-    return squares[:-2, :-2], (math.sqrt(squares[-2, -2]), math.sqrt(squares[-1, -1]))
+    return (gain, frequency), squares
