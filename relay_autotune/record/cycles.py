@@ -157,24 +157,23 @@ def find_relay(record: Record) -> RelayStretch | None:
     if change.size < 3:
         return None
     begins = np.concatenate(([0], change))
-    level = _levels(command[begins])
-    if level is None:
+    values = command[begins]
+    tolerance = _LEVEL_TOLERANCE * float(np.ptp(values))
+    if np.count_nonzero(np.diff(np.sort(values)) > tolerance) >= _MAX_LEVELS:
         return None
     # Command changes within one level are no switches.
-    kept = np.concatenate(([True], np.diff(level) != 0))
-    begins, level = begins[kept], level[kept]
-    best: tuple[int, int] | None = None
-    run = 0
-    for k in range(2, level.size + 1):
-        if k < level.size and level[k] == level[k - 2]:
-            continue
-        # Stays run .. k - 1 alternate between two levels.
-        if best is None or k - run > best[1] - best[0]:
-            best = (run, k)
-        run = k - 1
-    if best is None:
-        return None
-    return _stretch(record, begins, slice(*best))
+    begins = begins[np.concatenate(([True], np.abs(np.diff(values)) > tolerance))]
+    begin, stop = max(two_level_runs(command[begins]), key=lambda run: run[1] - run[0])
+    return _stretch(record, begins, slice(begin, stop + 1))
+
+
+def two_level_runs(levels: FloatArray) -> list[tuple[int, int]]:
+    """Return first change and the one after the last of each run between the same two levels.
+
+    :param levels: of a command, before its first change and after each, shape (m + 1,).
+    """
+    same = np.abs(levels[2:] - levels[:-2]) <= _LEVEL_TOLERANCE * np.ptp(levels)
+    return list(pairwise([0, *(1 + np.flatnonzero(~same)).tolist(), levels.size - 1]))
 
 
 def _find_following(record: Record) -> RelayStretch | None:
@@ -230,18 +229,6 @@ def _left(
             come = begin + np.flatnonzero(there[begin + 1 : end + 1] >= level)
             late += time[end] - time[come[0] if come.size else begin]
     return float(late / (time[at[-1]] - time[at[0]]))
-
-
-def _levels(values: FloatArray) -> IntArray | None:
-    """Return the number of the level of each value; None if there are too many for a relay."""
-    spread = float(np.max(values) - np.min(values))
-    order = np.argsort(values, kind="stable")
-    jumps = np.diff(values[order]) > _LEVEL_TOLERANCE * spread
-    if int(np.count_nonzero(jumps)) >= _MAX_LEVELS:
-        return None
-    number = np.empty(values.size, dtype=np.int64)
-    number[order] = np.concatenate(([0], np.cumsum(jumps)))
-    return number
 
 
 def _stretch(record: Record, begins: IntArray, stays: slice) -> RelayStretch | None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.record.cycles import follow_measurement
+from relay_autotune.record.cycles import follow_measurement, two_level_runs
 from relay_autotune.record.record import Input, Record, cached_on_record, roughness
 
 # Least number of switches between two levels for a relay phase: two whole cycles.
@@ -275,20 +275,10 @@ def _switching_parts(
 
 
 def _two_level_runs(changes: _Changes) -> list[tuple[int, int]]:
-    """Return first change and the one after the last of each run between the same two levels."""
-    levels, times = changes.levels, changes.times
-    spread = float(np.ptp(levels))
-    runs = []
-    k = 0
-    while k < times.size:
-        stop = k + 1
-        while stop < times.size and abs(levels[stop + 1] - levels[stop - 1]) <= 1e-6 * spread:
-            stop += 1
-        for begin, end in _without_long_stays(times, k, stop):
-            if end - begin >= _FEWEST_SWITCHES:
-                runs.append((begin, end))
-        k = stop
-    return runs
+    """Return first change and the one after the last of each run that may be a relay's."""
+    runs = two_level_runs(changes.levels)
+    parts = [part for run in runs for part in _without_long_stays(changes.times, *run)]
+    return [(begin, stop) for begin, stop in parts if stop - begin >= _FEWEST_SWITCHES]
 
 
 def _without_long_stays(times: FloatArray, begin: int, stop: int) -> list[tuple[int, int]]:
