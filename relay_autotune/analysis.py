@@ -392,7 +392,7 @@ def _judged(
         chosen = replace(chosen, warnings=(*chosen.warnings, told))
         found = replace(found, models=(chosen, *found.models[1:]))
     found = replace(found, shaping=shaping)
-    tuned = _tuned(found, shaping.task, tuning.rules)
+    tuned = _tuned(found, shaping.task, tuning)
     gains = tuned.best_gains
     if gains is None:
         return replace(tuned, judgement=replace(judgement, refused=tuned.reason))
@@ -435,8 +435,9 @@ def _simple(
     return found.model
 
 
-def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
+def _tuned(found: Analysis, task: DesignTask, tuning: _Tuning) -> Analysis:
     """Add the gains of the rules that apply to the selected model; the first rule must apply."""
+    rules = tuning.rules
     try:
         first = design(task, rules[0])
     except TuningError as error:
@@ -449,6 +450,9 @@ def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
             # Skip a rule that does not apply: it is only for comparison.
             continue
     delay = task.options.added_delay
+    if task.options.sample_period and not tuning.task.options.sample_period:
+        told = ", the interval of the recording; --sample-period names another"
+        gains = [replace(each, reason=each.reason + told) for each in gains]
     return replace(found, gains=tuple(gains), recommended=0, added_delay=delay)
 
 

@@ -222,6 +222,8 @@ def _verdict(judgement: Judgement) -> list[_Entry]:
         worse = [f for f in worse if f is not judgement.worst]
     # What was refused was not for its checks.
     told = [judgement.verdict.name.lower(), *[judgement.passed] * (not judgement.refused)]
+    if judgement.contradicted and not judgement.refused and judgement.worst is not None:
+        told[-1] += f"; failed: {judgement.worst.title.lower()}"
     return [
         ("verdict", ", ".join(told)),
         *((f"  {found.title.lower()}", found.said) for found in worse),
@@ -288,6 +290,8 @@ def _identification(found: Identification) -> list[_Entry]:
         share = f"{percent(rival.support)} % of the support"
         note = f"{rival.model.structure}, {share}"
         lines += _process("rivals" if i == 0 else "", rival.model, note)
+    if found.why_chosen:
+        lines.append(("", found.why_chosen))
     for warning in found.warnings:
         lines.append(("warning", warning))
     return lines

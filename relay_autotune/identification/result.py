@@ -17,6 +17,7 @@ from relay_autotune.identification.limit_cycle.fourier import FrequencyPoint
 from relay_autotune.process.transfer_function import TransferFunction, process_text
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import NORMAL_95, result_field, result_fields
+from relay_autotune.text import percent
 
 # Largest half interval of a determined value, relative to the value.
 DETERMINED = 0.2
@@ -233,6 +234,17 @@ class Identification:
     def model(self) -> TransferFunction:
         """The transfer function."""
         return self.estimate.model
+
+    @property
+    def why_chosen(self) -> str:
+        """Why it was taken before rivals of more support, a sentence; empty: there are none."""
+        if not any(rival.support > self.support for rival in self.rivals):
+            return ""
+        return (
+            f"the simplest structure that the record does not refute is taken, with "
+            f"{percent(self.support)} % of the support; the models on 95 % of which gains hold "
+            "are of all of them, by their support"
+        )
 
     @property
     def structure(self) -> str:

@@ -12,15 +12,18 @@ from types import SimpleNamespace
 from analysed import completed, doubted
 from report_cases import only
 
+from relay_autotune.analysis import analyse
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE, worst
 from relay_autotune.cli.jobs import status_of
 from relay_autotune.cli.table import table
 from relay_autotune.exchange.messages import fill_gains
 from relay_autotune.exchange.models import document
+from relay_autotune.identification.result import Rival
 from relay_autotune.report.case import case_of, cases_of_document
 from relay_autotune.report.findings import checks_of, verdict_of
 from relay_autotune.report.page import page
-from relay_autotune.verdict import NOT_JUDGED, Verdict
+from relay_autotune.tuning.task import DesignOptions
+from relay_autotune.verdict import NOT_JUDGED, Result, Verdict
 
 
 def test_the_worst_exit_status_is_not_the_largest_number():
@@ -57,6 +60,46 @@ def test_a_doubt_marks_the_gains_in_table_document_page_and_message(monkeypatch)
     )
     fill_gains(message, found.best_gains, judgement=found.judgement)
     assert (message.verdict, message.verdict_reason) == (Verdict.DOUBTFUL, said)
+
+
+def test_a_failed_check_is_named_beside_the_verdict():
+    found = doubted()
+    (worst,) = [f for f in found.judgement.findings if f.result is not Result.PASSED]
+    failed = [
+        replace(f, result=Result.FAILED) if f is worst else f for f in found.judgement.findings
+    ]
+    judgement = replace(found.judgement, findings=tuple(failed))
+    text = table("tank", [replace(found, judgement=judgement, gains=(), recommended=None)])
+    count = len(failed)
+    said = f"none, {count - 1} of {count} checks passed; failed: {worst.title.lower()}"
+    assert said in " ".join(text.split())
+
+
+def test_it_is_said_why_a_rival_of_more_support_is_not_taken(monkeypatch):
+    only(monkeypatch)
+    found = completed()
+    (model, *others) = found.models
+    rivals = (Rival(model.estimate, 0.82), Rival(model.estimate, 0.05))
+    for support, told in ((0.13, True), (0.9, False)):
+        chosen = replace(model, support=support, rivals=rivals)
+        shown = replace(found, models=(chosen, *others))
+        said = "the simplest structure that the record does not refute is taken, with 13 % of"
+        assert (said in " ".join(table("tank", [shown]).split())) == told
+        case = replace(case_of(shown, "tank"), record=None, cycles=(), models_around=())
+        assert (said.capitalize() in page([case])) == told
+
+
+def test_the_period_of_the_controller_is_said_with_the_gains():
+    record = completed().record
+    own = analyse(record).best_gains.reason
+    period = f"{record.interval:.3g}"
+    assert own.endswith(
+        f"; for a controller that runs every {period} s, the interval of the recording; "
+        "--sample-period names another"
+    )
+    given = analyse(record, options=DesignOptions(sample_period=0.5 * record.interval))
+    told = given.best_gains.reason
+    assert told.endswith(f"; for a controller that runs every {0.5 * record.interval:g} s")
 
 
 def test_a_document_gives_the_judgement_back():
