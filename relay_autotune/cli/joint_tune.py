@@ -38,9 +38,9 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.controller_manager import (
     ControllerManager,
     ManagedController,
-    Opened,
     forwarding,
     in_the_way,
+    opened,
 )
 from relay_autotune.nodes.gains_place import gains_at, gains_text, put_gains
 from relay_autotune.nodes.joint_loop import COMMAND_TYPE, STATE_TYPE, joint_loop
@@ -403,10 +403,10 @@ class JointLoop(Loop):
             if forward is not None:
                 # Controllers that command 0 when they are switched off leave it to the next one.
                 with self._client.publishing(*self._first_command()) as command:
-                    opened = Opened(
-                        self._manager, forward.name, self._former, self._give_references_back
+                    give_back = self._give_references_back
+                    stack.enter_context(
+                        opened(self._manager, forward.name, self._former, give_back)
                     )
-                    stack.enter_context(opened)
                     command()
             why_lost = self._manager.still_active(forward.name if forward else loop.controller)
 

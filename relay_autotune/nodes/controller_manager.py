@@ -8,9 +8,9 @@ from __future__ import annotations
 import importlib
 import shlex
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any
 
 from relay_autotune.errors import LoopError
@@ -305,72 +305,61 @@ def forwarding(
     )
 
 
-class Opened:
-    """A joint whose controllers are off while a forwarding one passes commands on.
+@contextmanager
+def opened(
+    manager: ControllerManager, forward: str, former: Sequence[str], then: Callable[[], object]
+) -> Iterator[None]:
+    """Pass commands to a joint, whose controllers are off until the end of the block.
 
     One strict switch does both. At the end of the block, however it ends, the former controllers
     are active again, which the manager's list has to show.
 
     :param manager: the manager.
-    :param forward: name of the forwarding controller.
+    :param forward: name of the controller that passes commands on.
     :param former: names of those that are switched off.
     :param then: called when they are active again.
+    :raises LoopError: with what to type, if they are not.
     """
-
-    def __init__(
-        self,
-        manager: ControllerManager,
-        forward: str,
-        former: tuple[str, ...],
-        then: Callable[[], object],
-    ) -> None:
-        self._manager, self._forward, self._former = manager, forward, former
-        self._then = then
-
-    def __enter__(self) -> Opened:
+    error = None
+    try:
+        # An answer that is lost need not be a refusal.
+        manager.switch([forward], former)
+        yield
+    except BaseException as raised:
+        error = raised
+        raise
+    finally:
         try:
-            self._manager.switch([self._forward], self._former)
-        except BaseException:
-            # An answer that is lost need not be a refusal.
-            self.close()
-            raise
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        try:
-            self.close()
+            close(manager, forward, former)
+            then()
         except LoopError as left:
             raise LoopError(f"{error}; and {left}" if error else str(left)) from error
 
-    def close(self) -> None:
-        """Activate the former controllers, and look until they are active.
 
-        :raises LoopError: with what to type, if they are not.
-        """
-        manager = self._manager
-        deadline = time.monotonic() + _BACK_WITHIN
-        problem = ""
-        while (left := deadline - time.monotonic()) > 0.0:
-            try:
-                states = {each.name: each.state for each in manager.controllers(left)}
-                lacking = [name for name in self._former if states.get(name) != _ACTIVE]
-                extra = [self._forward] if states.get(self._forward) == _ACTIVE else []
-                if not lacking and not extra:
-                    break
-                # A strict switch is refused as a whole for one that is in its state already.
-                manager.switch(lacking, extra, deadline - time.monotonic())
-            except LoopError as error:
-                problem = str(error)
-                manager.client.rest(_AGAIN)
-        else:
-            typed = manager.command_for(self._former, [self._forward])
-            raise LoopError(
-                f"{', '.join(self._former)} could not be activated again"
-                f"{f' ({problem})' if problem else ''}: see to the joint, then type: {typed}"
-            )
-        self._then()
+def close(manager: ControllerManager, forward: str, former: Sequence[str]) -> None:
+    """Activate the former controllers of a joint, and look until they are active.
+
+    :param manager: the manager.
+    :param forward: name of the controller that is switched off.
+    :param former: names of those that are activated.
+    :raises LoopError: with what to type, if they are not.
+    """
+    deadline = time.monotonic() + _BACK_WITHIN
+    problem = ""
+    while (left := deadline - time.monotonic()) > 0.0:
+        try:
+            states = {each.name: each.state for each in manager.controllers(left)}
+            lacking = [name for name in former if states.get(name) != _ACTIVE]
+            extra = [forward] if states.get(forward) == _ACTIVE else []
+            if not lacking and not extra:
+                return
+            # A strict switch is refused as a whole for one that is in its state already.
+            manager.switch(lacking, extra, deadline - time.monotonic())
+        except LoopError as error:
+            problem = str(error)
+            manager.client.rest(_AGAIN)
+    raise LoopError(
+        f"{', '.join(former)} could not be activated again"
+        f"{f' ({problem})' if problem else ''}: see to the joint, then type: "
+        f"{manager.command_for(former, [forward])}"
+    )

@@ -27,8 +27,8 @@ from relay_autotune.nodes import joint_loop as joint_loop_module
 from relay_autotune.nodes.controller_manager import (
     ControllerManager,
     ManagedController,
-    Opened,
     above,
+    close,
     forwarding,
     in_the_way,
 )
@@ -319,11 +319,10 @@ def test_a_manager_that_is_gone_is_not_waited_for_beyond_the_time_of_the_way_bac
             raise LoopError("no answer")
 
     now = [0.0]
-    opened = Opened(Gone(), "one", ("pid",), lambda: asked.append("references"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(controller_manager, "time", SimpleNamespace(monotonic=lambda: now[0]))
         with pytest.raises(LoopError, match=r"pid could not be .* \(no answer\).* type: type pid"):
-            opened.close()
+            close(Gone(), "one", ("pid",))
     assert sum(asked) <= controller_manager._BACK_WITHIN
 
 
