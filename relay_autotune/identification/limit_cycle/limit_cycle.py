@@ -39,6 +39,9 @@ _LEAST_SAMPLES = 4
 # Largest level at a switch, over the amplitude.
 MOST_LEVEL = 0.99
 
+# Relative errors of a period and an amplitude read off a chart.
+CHART_ERRORS = (0.002, 0.01)
+
 NOT_SETTLED = "the limit cycle had not settled: its last cycles still differ"
 
 
@@ -189,6 +192,7 @@ class SymmetricCycle:
     :param relay: h, amplitude of the relay [u].
     :param level: measurement at the switch, the hysteresis epsilon of an ideal relay [y].
     :param dead_time: D, of the process and what the relay added to it [s].
+    :param errors: relative errors of period and amplitude.
     """
 
     period: float
@@ -196,12 +200,13 @@ class SymmetricCycle:
     relay: float
     level: float
     dead_time: float
+    errors: tuple[float, float] = CHART_ERRORS
 
     @classmethod
-    def of(cls, test: RelayTest, read: Reading) -> SymmetricCycle:
+    def of(cls, test: RelayTest, read: Reading, errors: tuple[float, float]) -> SymmetricCycle:
         """Return what :meth:`RelayTest.read` has read, with a dead time as the last number."""
         period, amplitude, level, dead_time = read.values.tolist()
-        return cls(period, amplitude, test.settings.amplitude, level, dead_time)
+        return cls(period, amplitude, test.settings.amplitude, level, dead_time, errors)
 
     @property
     def frequency(self) -> float:

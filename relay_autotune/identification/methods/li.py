@@ -32,6 +32,7 @@ from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.limit_cycle.fold import Reading
 from relay_autotune.identification.limit_cycle.limit_cycle import (
+    CHART_ERRORS,
     RelayTest,
     SymmetricCycle,
     relay_test,
@@ -50,12 +51,9 @@ from relay_autotune.identification.methods.lags import (
 from relay_autotune.identification.methods.solved import Fit, literally, structure_asked_for
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.process.structures import Structure, equal_lags
-from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Record
 
 METHOD = "li"
-# Relative errors of a period and an amplitude read off a chart.
-CHART_ERRORS = (0.002, 0.01)
 # Largest misfit that is agreement, in assumed errors.
 AGREEMENT = 2.0
 
@@ -108,17 +106,15 @@ def fit_jointly(
     dead_time: float = math.nan,
     *,
     exact: bool = True,
-    errors: Sequence[tuple[float, float]] = (),
     sign: int = 1,
 ) -> JointFit:
     """Fit a model to the limit cycles of several tests.
 
     :param model: which one.
-    :param tests: at least two; the ``dead_time`` of each is what was added to the relay.
+    :param tests: at least two; the ``dead_time`` of each is what was added to the relay. Their
+        ``errors`` weight them.
     :param dead_time: of the process [s]; NaN: fitted.
     :param exact: False: to the points of the describing function.
-    :param errors: relative errors of the period and the amplitude of each test, which weight
-        them; default: ``CHART_ERRORS``.
     :param sign: of the gain.
     :raises IdentificationError: if the tests do not differ, or no such model comes near them.
     """
@@ -135,9 +131,8 @@ def fit_jointly(
             f"period for a switch to take effect: it must be below {longest:g} s"
         )
     measure = _of_cycle if exact else _of_point
-    deviations = np.array(errors or (CHART_ERRORS,) * len(tests))
-    # A point is as uncertain as its amplitude, in its phase too.
-    deviations = (deviations if exact else deviations[:, [1, 1]]).ravel()
+    # A point is as uncertain as its amplitude, in its phase too; both are as those of a chart.
+    deviations = np.array([t.errors if exact else CHART_ERRORS[1:] * 2 for t in tests]).ravel()
 
     def residual(values: FloatArray) -> FloatArray:
         away = [each for test in tests for each in measure(model, values, test)]
@@ -163,18 +158,14 @@ def fit_jointly(
     return JointFit(model, values, misfit, covariance)
 
 
-def fits_jointly(
-    tests: Sequence[SymmetricCycle],
-    known: Known,
-    errors: Sequence[tuple[float, float]] = (),
-    sign: int = 1,
-) -> list[JointFit]:
+def fits_jointly(tests: Sequence[SymmetricCycle], known: Known, sign: int = 1) -> list[JointFit]:
     """Fit the structure that is known, or models 1 to 5, and return those that agree.
 
     They agree with all tests, the simplest first; if none does, it is the one that comes nearest.
 
-    :param tests: as for :func:`fit_jointly`, as are the last two.
+    :param tests: as for :func:`fit_jointly`.
     :param known: structure, order and dead time where they are known.
+    :param sign: of the gain.
     :raises IdentificationError: if no model can be fitted.
     """
     fits: list[JointFit] = []
@@ -182,7 +173,7 @@ def fits_jointly(
     asked = structure_asked_for(METHOD, known, STRUCTURES)
     for model in (asked,) if asked else _CHOICE:
         try:
-            fits.append(fit_jointly(model, tests, known.dead_time, errors=errors, sign=sign))
+            fits.append(fit_jointly(model, tests, known.dead_time, sign=sign))
         except IdentificationError as error:
             refusals.append(error)
     if not fits:
@@ -277,24 +268,13 @@ def identify_li_jointly(records: Sequence[Record], known: Known = NOTHING) -> Id
             "one process"
         )
     readings = [test.read(lambda *_, test=test: test.settings.extra_delay) for test in tests]
-    cycles = [SymmetricCycle.of(*pair) for pair in zip(tests, readings, strict=True)]
-    require_difference(cycles)
-    errors = [_errors(test, read) for test, read in zip(tests, readings, strict=True)]
-    candidates = fits_jointly(cycles, known, errors, tests[0].sign)
-    away = [_shape_misfit(tests, cycles, candidate) for candidate in candidates]
-    fit = next(c for c, a in zip(candidates, away, strict=True) if alike(a, min(away)))
-    known_scatter = any(read.covariance is not None for read in readings)
+    cycles = [_cycle(*pair) for pair in zip(tests, readings, strict=True)]
     remarks = [
         f"test {number}: {remark}"
         for number, test in enumerate(tests, start=1)
         for remark in test.remarks()
     ]
-    return identified(
-        METHOD,
-        Estimate.of(fit.model, fit.values, fit.covariance if known_scatter else None),
-        Reading(fit.values, None, sum(r.cycles - 1 for r in readings) + 1).quantile,
-        warnings=(*remarks, *_remarks(cycles, known, fit)),
-    )
+    return _identified(cycles, known, tests, readings, remarks)
 
 
 def li_from_numbers(cycles: Sequence[SymmetricCycle], known: Known) -> Identification:
@@ -305,9 +285,27 @@ def li_from_numbers(cycles: Sequence[SymmetricCycle], known: Known) -> Identific
     :param known: dead time, structure and order where they are known.
     :raises IdentificationError: if they do not differ, or no model agrees with them.
     """
-    fit = fits_jointly(cycles, known)[0]
-    estimate = Estimate.of(fit.model, fit.values)
-    return identified(METHOD, estimate, NORMAL_95, warnings=tuple(_remarks(cycles, known, fit)))
+    return _identified(cycles, known)
+
+
+def _identified(
+    cycles: Sequence[SymmetricCycle],
+    known: Known,
+    tests: Sequence[RelayTest] = (),
+    readings: Sequence[Reading] = (),
+    remarks: Sequence[str] = (),
+) -> Identification:
+    candidates = fits_jointly(cycles, known, tests[0].sign if tests else 1)
+    away = [_shape_misfit(tests, cycles, candidate) for candidate in candidates]
+    fit = next(c for c, a in zip(candidates, away, strict=True) if alike(a, min(away)))
+    known_scatter = any(read.covariance is not None for read in readings)
+    averaged = sum(read.cycles - 1 for read in readings) + 1
+    return identified(
+        METHOD,
+        Estimate.of(fit.model, fit.values, fit.covariance if known_scatter else None),
+        Reading(fit.values, None, averaged).quantile,
+        warnings=(*remarks, *_remarks(cycles, known, fit)),
+    )
 
 
 def _shape_misfit(
@@ -316,18 +314,19 @@ def _shape_misfit(
     """Return how far the half cycles of all tests are from a model's, over their amplitudes."""
     gain, *constants, dead_time = np.abs(fit.values).tolist()
     delayed = [replace(cycle, dead_time=dead_time + cycle.dead_time) for cycle in cycles]
-    pairs = zip(tests, delayed, strict=True)
+    pairs = zip(tests, delayed, strict=False)
     return math.hypot(*(shape_misfit(t, fit.model, c, (gain, *constants)) for t, c in pairs))
 
 
-def _errors(test: RelayTest, read: Reading) -> tuple[float, float]:
-    """Return relative errors of the averaged period and amplitude."""
+def _cycle(test: RelayTest, read: Reading) -> SymmetricCycle:
+    """Return the averaged limit cycle, with the relative errors of period and amplitude."""
     period, amplitude = (np.nan_to_num(read.std[:2]) / read.values[:2]).tolist()
     sampled = _SHARE_OF_INTERVAL * test.record.interval / float(read.values[0])
-    return (
+    errors = (
         max(period, sampled, _LEAST_PERIOD_ERROR),
         max(amplitude, _LEAST_AMPLITUDE_ERROR),
     )
+    return SymmetricCycle.of(test, read, errors)
 
 
 def _remarks(cycles: Sequence[SymmetricCycle], known: Known, fit: JointFit) -> list[str]:
