@@ -10,6 +10,8 @@ import pytest
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import carried
+from relay_autotune.identification.methods.solved import Fit
+from relay_autotune.process.structures import SOPDT
 
 RNG = np.random.default_rng(3)
 COVARIANCE = np.cov(RNG.standard_normal((4, 30))) * np.outer((1, 1e3, 1e-4, 0), (1, 1e3, 1e-4, 0))
@@ -40,3 +42,15 @@ def test_at_an_end_one_side_is_enough_and_with_none_nothing_is_known():
     assert carried(root, np.zeros(1), np.eye(1)) == pytest.approx(9.0)
     assert np.isnan(carried(lambda x: root(np.abs(x)), np.zeros(1), np.eye(1))).all()
     assert np.isnan(carried(root, np.zeros(1), np.full((1, 1), np.nan))).all()
+
+
+def test_a_value_without_effect_is_uncertain_and_leaves_the_others_certain():
+    # Two numbers, the gain and the first time constant, each known to 1 %.
+    truth, given = np.array((2.0, 3.0, 1e-12, 0.5)), np.full(4, np.nan)
+    given[3] = truth[3]
+    fit = Fit(SOPDT, given, 1, lambda values: np.log(values[:2] / truth[:2]) / 0.01, 1.0)
+    _, x = fit.best((truth,))
+    covariance = fit.covariance(x)
+    assert np.sqrt(np.diag(covariance)[:2]) == pytest.approx(0.01 * truth[:2], rel=1e-6)
+    assert np.sqrt(covariance[2, 2]) > 1e3 * truth[2]
+    assert np.all(covariance[3] == 0.0)
