@@ -39,7 +39,7 @@ from relay_autotune.errors import NotThereError, RelayAutotuneError, SelectionEr
 from relay_autotune.exchange.export import EXPORTS, WITHOUT_LAW, Target, exported
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import ONLY_JOINT
-from relay_autotune.loop.gains import Controller, Gains
+from relay_autotune.loop.gains import FORMS, Controller, Gains
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import declared
 from relay_autotune.record.excitation import resting_command
@@ -74,6 +74,7 @@ class Job:
     :param export: the kind of file that is wanted instead, and where its gains go; None: none.
     :param accept_doubtful: True: the file may hold gains whose verdict is doubtful.
     :param present: the gains that the controller has now, to see them beside; None: not known.
+    :param form: form of the gains in the table, one of ``FORMS``.
     """
 
     name: str
@@ -87,6 +88,7 @@ class Job:
     export: tuple[str, Target] | None = None
     accept_doubtful: bool = False
     present: Controller | None = None
+    form: str = FORMS[0]
 
     @property
     def label(self) -> str:
@@ -247,7 +249,7 @@ def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> s
             return "\n".join(rows(job.label, analyses, why, job.name_width, job.table_width))
         if error is not None:
             return ""
-        return table(job.name, analyses, job.table_width, job.present)
+        return table(job.name, analyses, job.table_width, job.present, job.form)
     # Imported here, since a table for people does not need it.
     from relay_autotune.exchange.models import document, to_json
 

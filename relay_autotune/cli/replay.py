@@ -41,6 +41,7 @@ from relay_autotune.cli.report import (
 from relay_autotune.cli.table import heading
 from relay_autotune.cli.terminal import ProgressLine, Stages, require_new, width, write
 from relay_autotune.errors import SelectionError
+from relay_autotune.loop.gains import FORMS
 from relay_autotune.result import Analysis
 
 if TYPE_CHECKING:
@@ -101,6 +102,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("bags", nargs="+", metavar="BAG", help="recordings")
     add_analysis(parser)
+    parser.add_argument(
+        "--form", choices=FORMS, default=FORMS[0],
+        help="form in which gains are shown, too; ISA and parallel form always are",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print one JSON document a bag")
     parser.add_argument(
         "--report", metavar="FILE", help="also write a report: .html, or a .png, .svg or .pdf"
@@ -183,6 +188,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     with_table = not (options.json or options.output)
     recordings = _recordings(options.bags)
     jobs = jobs_of(options, recordings, table_width=width() if with_table else None)
+    jobs = [replace(job, form=options.form) for job in jobs]
     if with_table and len(jobs) > 1 and any(recordings_in(Path(name)) for name in options.bags):
         name_width = min(max(len(job.label) for job in jobs), _LONGEST_NAME)
         jobs = [replace(job, name_width=name_width) for job in jobs]

@@ -20,6 +20,8 @@ from relay_autotune.cli.terminal import (
     labelled,
     with_units,
 )
+from relay_autotune.errors import TuningError
+from relay_autotune.loop.gains import series_form
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import limit_cycle
@@ -48,6 +50,7 @@ def table(
     analyses: Sequence[Analysis],
     width: int = WIDEST,
     present: Controller | None = None,
+    form: str = "isa",
 ) -> str:
     """Return what was made of each experiment of a recording.
 
@@ -55,12 +58,13 @@ def table(
     :param analyses: one for each experiment.
     :param width: columns that a line may have.
     :param present: the gains that the controller has now; None: not known.
+    :param form: "series": gains are also given in that form.
     """
     blocks = [bag]
     for number, analysis in enumerate(analyses, start=1):
         which = f" {number} of {len(analyses)}" if len(analyses) > 1 else ""
         with with_units(analysis.record.units):
-            blocks.append("\n".join(_laid_out(_experiment(analysis, which), width)))
+            blocks.append("\n".join(_laid_out(_experiment(analysis, which, form), width)))
             if compared := compared_lines(analysis, present, width):
                 blocks.append("\n".join(compared))
     return "\n\n".join(blocks) + "\n"
@@ -145,18 +149,25 @@ def gains_lines(
     gains: Gains,
     verdict: Verdict = Verdict.UNKNOWN,
     width: int = WIDEST,
-    forms: Sequence[tuple[str, str]] = (),
+    form: str = "isa",
 ) -> list[str]:
     """Return a controller with what it does on the model, as lines.
 
     :param gains: the controller, or a message with the same fields.
     :param verdict: on the experiment that it comes from.
     :param width: columns that a line may have.
-    :param forms: further forms of the gains, each by its name.
+    :param form: "series": they are also given in that form.
+    :raises TuningError: if they do not have it.
     """
-    rule, isa, *rest = _gains(gains, verdict)
-    further = [(f"  {name}", text) for name, text in forms]
-    return _laid_out([rule, isa, *further, *rest], width)
+    return _laid_out(_gains(gains, verdict, _series(gains) if form == "series" else ()), width)
+
+
+def _series(gains: Gains) -> tuple[str, ...]:
+    found = series_form(gains)
+    return (
+        f"kc {digits(found.kc)} u/y   ti {digits(found.ti)} s   td {digits(found.td)} s   "
+        f"alpha {digits(found.alpha, 3)}   b {gains.b:g}",
+    )
 
 
 def beside(
@@ -193,7 +204,7 @@ def _laid_out(entries: Sequence[_Entry], width: int) -> list[str]:
     return [line for label, text in entries for line in labelled(label, text, width)]
 
 
-def _experiment(analysis: Analysis, which: str) -> list[_Entry]:
+def _experiment(analysis: Analysis, which: str, form: str) -> list[_Entry]:
     record = analysis.record
     lines = [(f"experiment{which}", _outcome(record))]
     # The reason for no gains begins with it.
@@ -208,7 +219,13 @@ def _experiment(analysis: Analysis, which: str) -> list[_Entry]:
     if analysis.models and analysis.judgement.judged:
         lines += [_BLANK, *_verdict(analysis.judgement)]
     if analysis.best_gains is not None:
-        lines += [_BLANK, *_gains(analysis.best_gains, analysis.verdict)]
+        series: tuple[str, ...] = ()
+        if form == "series":
+            try:
+                series = _series(analysis.best_gains)
+            except TuningError as error:
+                series = (f"none: {error}",)
+        lines += [_BLANK, *_gains(analysis.best_gains, analysis.verdict, series)]
         lines += _other_gains(analysis)
     if analysis.reason:
         lines += [_BLANK, ("gains" if analysis.models else "process", analysis.reason)]
@@ -371,7 +388,7 @@ def _other_gains(analysis: Analysis) -> list[_Entry]:
     ]
 
 
-def _gains(gains: Gains, verdict: Verdict) -> list[_Entry]:
+def _gains(gains: Gains, verdict: Verdict, series: Sequence[str]) -> list[_Entry]:
     mark = "   DOUBTFUL: see the verdict" if verdict is Verdict.DOUBTFUL else ""
     lines = [
         ("gains", gains.rule + mark),
@@ -381,6 +398,7 @@ def _gains(gains: Gains, verdict: Verdict) -> list[_Entry]:
             + (f"   tf {digits(gains.tf)} s" if gains.tf else "")
             + f"   b {gains.b:g}",
         ),
+        *(("  series form", text) for text in series),
         (
             "  parallel form",
             f"p {digits(gains.p)} u/y   i {digits(gains.i)} u/(y s)   d {digits(gains.d)} u s/y",

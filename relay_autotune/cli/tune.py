@@ -319,15 +319,8 @@ class _Designs:
 
         :raises TuningError: if they do not have the form.
         """
-        (gains,), forms = self.gains, []
-        if self.form == "series":
-            series = series_form(gains)
-            told = "   ".join(
-                f"{n} {digits(getattr(series, n))} {unit}" for n, unit in _ISA.items()
-            )
-            told += f"   alpha {digits(series.alpha, 3)}   b {gains.b:g}"
-            forms = [("series form", told)]
-        return [*self._process(), *gains_lines(gains, width=width(), forms=forms)]
+        (gains,) = self.gains
+        return [*self._process(), *gains_lines(gains, width=width(), form=self.form)]
 
     def side_by_side(self) -> list[str]:
         """Return a line for each rule and each controller with a model inside, and why not."""

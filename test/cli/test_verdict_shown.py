@@ -102,6 +102,18 @@ def test_the_period_of_the_controller_is_said_with_the_gains():
     assert told.endswith(f"; for a controller that runs every {0.5 * record.interval:g} s")
 
 
+def test_gains_are_shown_in_the_series_form_where_they_have_one():
+    found = completed()
+    best = replace(found.best_gains, kc=2.0, ti=10.0, td=1.6, tf=0.0)
+    for td, told in (
+        (1.6, "kc 1.600 u/y ti 8.000 s td 2.000 s"),
+        (3.0, "none: ti = 10 s is less"),
+    ):
+        shown = replace(found, gains=(replace(best, td=td),), recommended=0)
+        assert f"series form {told}" in " ".join(table("tank", [shown], form="series").split())
+    assert "series form" not in table("tank", [found])
+
+
 def test_a_document_gives_the_judgement_back():
     for found in (completed(), doubted()):
         (read,) = cases_of_document(json.loads(json.dumps(document("t", [found]))), "t")
