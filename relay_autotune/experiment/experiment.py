@@ -39,7 +39,6 @@ from relay_autotune.experiment.phases import (
     Facts,
     Kick,
     Left,
-    Phase,
     Probe,
     Samples,
     Settle,
@@ -53,6 +52,15 @@ from relay_autotune.reasons import NONE, Code, Reason, other
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 
 _BASELINE = SafePolicy()
+
+Phase = Settle | Kick | Probe | Switching
+"""A state of an experiment, with the data that only this state needs.
+
+``command`` answers the sample with which it begins [u], ``latest`` is its deadline, gaps not
+counted [s], inf: max_duration alone limits it; ``where`` is the state as the end of a sentence.
+``answer`` takes the last sample, its time without gaps [s] and the measurement [y]; ``status``
+says what it waits for and sees, after the same sample.
+"""
 
 _TRANSITIONS: Mapping[tuple[State, Event], tuple[State, Callable[[Setup, Facts], Phase]]] = {
     (State.SETTLING, Event.STEADY): (State.KICK, Kick),

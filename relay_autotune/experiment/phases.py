@@ -15,7 +15,6 @@ from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 
@@ -244,28 +243,6 @@ _SMALL_STAYS = 10.0
 _USUAL_EXTRA = 2
 SMALL_CYCLES = 2
 """Oscillations that a given amplitude takes longer where it begins small: one, and the way on."""
-
-
-class Phase(Protocol):
-    """A state of an experiment, with the data that only this state needs."""
-
-    @property
-    def command(self) -> float:
-        """The command that answers the sample with which the state began [u]."""
-
-    @property
-    def latest(self) -> float:
-        """Deadline, gaps not counted [s]; inf: max_duration alone limits it."""
-
-    @property
-    def where(self) -> str:
-        """The state as the end of a sentence."""
-
-    def answer(self, t: float, y: float, /) -> Answer:
-        """Take the last sample, its time without gaps [s] and the measurement [y]."""
-
-    def status(self, t: float, y: float, /) -> str:
-        """Say what the state waits for and sees, after the same sample."""
 
 
 def _settling_limit(setup: Setup) -> float:

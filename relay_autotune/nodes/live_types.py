@@ -166,7 +166,9 @@ class CommandMessage:
                 f"float32 or float64, which can hold the relay's levels"
             )
         self._is_single = number.form == "f4"
-        self._value, self._put = reading(steps), setting(steps)
+        self.value: Callable[[Any], float] = reading(steps)
+        """Returns the command in a message [u]; raises `FieldError` if it does not tell it."""
+        self._put = setting(steps)
         if steps == ("data",):
             self._put = _set_data
         self._beside = "what other_commands says" if taken else given or "zeros"
@@ -204,13 +206,6 @@ class CommandMessage:
             return command
         return float(struct.unpack("f", struct.pack("f", command))[0])
 
-    def value(self, message: Any) -> float:
-        """Return the command in a message [u].
-
-        :raises FieldError: if the message does not tell it.
-        """
-        return self._value(message)
-
     def take_others(self, message: Any) -> None:
         """Take the other elements from a message; those before stay where it lacks the command's.
 
@@ -244,7 +239,7 @@ class CommandMessage:
         return "data[0]"
 
     def _require_whole(self, message: Any) -> None:
-        self._put(message, self._value(message))
+        self._put(message, self.value(message))
         alike = _ALIKE.get(self.type_name, ())
         if len({len(getattr(message, name)) for name in alike}) > 1:
             found = ", ".join(f"{len(getattr(message, name))} {name}" for name in alike)
