@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -146,7 +145,7 @@ def in_another_node(gains: Controller, rate: LawRate | None, feedforward: float)
     return Control(weighted, rate, elsewhere=True)
 
 
-class Place(ABC):
+class _Place:
     """Where gains act.
 
     :param name: of the controlling node, for people.
@@ -187,34 +186,8 @@ class Place(ABC):
         """
         return Control(gains, self._rate)
 
-    @abstractmethod
-    def require_law(self, gains: Gains) -> None:
-        """Refuse gains that are for a law which does not run there.
 
-        :raises TuningError: with what to do.
-        """
-
-    @abstractmethod
-    async def read(self) -> GainSet | None:
-        """Return the gains in force if another node may have changed them, else None.
-
-        :raises RelayAutotuneError: if they cannot be read.
-        """
-
-    @abstractmethod
-    async def put(self, gains: GainSet | None) -> None:
-        """Apply gains, all or none.
-
-        :param gains: None: hold the command, if the place can.
-        :raises RelayAutotuneError: if they are not in force, or it is unknown whether they are.
-        """
-
-    @abstractmethod
-    def said(self, gains: GainSet | None) -> str:
-        """Return a sentence on the gains in force now."""
-
-
-class OwnGains(Place):
+class OwnGains(_Place):
     """The controller of this node.
 
     :param use: puts gains in force; None: the command is held.
@@ -272,7 +245,7 @@ def said(gains: Controller | None) -> str:
     return f"kc {gains.kc:.6g}, ti {gains.ti:.6g} s, td {gains.td:.6g} s"
 
 
-class RemoteGains(Place):
+class RemoteGains(_Place):
     """The parameters of another node.
 
     Each service call is given up after `TIMEOUT`, because the other node may hang.
@@ -366,6 +339,14 @@ class RemoteGains(Place):
         finally:
             self._node.destroy_timer(timer)
 
+
+Place = OwnGains | RemoteGains
+"""Where gains act.
+
+``require_law`` refuses gains for a law that does not run there; ``read`` returns those in force if
+another node may have changed them, else None; ``put`` applies gains, all or none; ``said`` tells
+which are in force. All but the last raise RelayAutotuneError.
+"""
 
 # A controller without a command for this time counts as silent [s].
 _SILENCE = 2.0
