@@ -156,7 +156,7 @@ class JointLoop(Loop):
                     + ("" if self._forward else ", stays active"),
                 ),
                 *self._moves(),
-                ("gains now", ", ".join(map("{} {:.6g}".format, "pid", loop.gains))),
+                ("present gains", ", ".join(map("{} {:.6g}".format, "pid", loop.gains))),
                 ("gains then", self._applied()),
             )
         ]

@@ -83,7 +83,7 @@ def compared_lines(
     if present is None or model is None or gains is None:
         return []
     with with_units(analysis.record.units):
-        return beside(present, gains, model.model, width, "present", analysis.added_delay)
+        return beside(present, gains, model.model, width, analysis.added_delay)
 
 
 # Columns of a table with one line for each experiment, and their widths.
@@ -175,7 +175,6 @@ def beside(
     gains: Gains,
     model: TransferFunction,
     width: int = WIDEST,
-    head: str = "in force",
     added_delay: float = math.nan,
 ) -> list[str]:
     """Return the present gains and the new ones, with what each does on the model.
@@ -184,7 +183,6 @@ def beside(
     :param gains: the new ones.
     :param model: the process.
     :param width: columns that a line may have.
-    :param head: what stands above the present gains.
     :param added_delay: as of `performance_beside`.
     """
     # here, for they load scipy: a tune is shown with this module, and begins before that
@@ -194,7 +192,7 @@ def beside(
     now = None if present is None else performance_beside(present, gains, model, added_delay)
     both = zip(compared_numbers(present, now), compared_numbers(gains, gains), strict=True)
     rows = [(name, old, new, unit) for (name, old, unit, _), (_, new, _, _) in both]
-    lines = in_columns([("", head, "new", ""), *rows], width)
+    lines = in_columns([("", "present", "new", ""), *rows], width)
     if present is not None:
         lines += labelled("compared", difference(now, gains), width)
     return lines
@@ -355,8 +353,7 @@ def _fit(found: Identification) -> str:
         least = fit.whiteness_p < _SURE
         parts.append(f"whiteness p {'< 0.0001' if least else '= ' + digits(fit.whiteness_p, 2)}")
     if math.isfinite(fit.noise_to_signal):
-        power, mean = digits(fit.noise_to_signal_power, 2), digits(fit.noise_to_signal, 2)
-        parts.append(f"noise to signal N1 = {power}, N2 = {mean}")
+        parts.append(f"noise {percent(fit.noise_to_signal)} % of the signal")
     return ", ".join(parts) or "not estimated"
 
 
@@ -432,7 +429,8 @@ def _gains(gains: Gains, verdict: Verdict, series: Sequence[str]) -> list[_Entry
 
 def _step(does: Performance) -> str:
     return (
-        f"overshoot {percent(does.overshoot)} %   settled after {digits(does.settling_time, 3)} s"
+        f"overshoot {percent(does.overshoot)} %   settled within 2 % after "
+        f"{digits(does.settling_time, 3)} s"
     )
 
 
