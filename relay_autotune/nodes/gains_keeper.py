@@ -19,6 +19,7 @@ import stat
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,7 @@ class GainsJournal:
         self._lock = threading.Lock()
         self._newest = 0
         self._held: int | None = None
-        # A folder that is not writable is reported by `save`; some file systems have no locks.
+        # A folder that is not writable is reported by `saving`; some file systems have no locks.
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
             self._held = os.open(
@@ -144,18 +145,18 @@ class GainsJournal:
             raise _unreadable(path, f"it is of version {_short(version)}, expected {_VERSION}")
         return loop, history
 
-    def ticket(self) -> int:
-        """Return the number of the next state to save."""
-        self._newest += 1
-        return self._newest
+    def saving(self, history: GainsHistory) -> Callable[[], None]:
+        """Return what writes a state and waits until it is on the disk; any thread may call it.
 
-    def save(self, history: GainsHistory, ticket: int) -> None:
-        """Write a state and wait until it is on the disk; may be called by any thread.
+        A state is skipped once this was called for a later one. It raises JournalError if it
+        cannot be written; the previous state stays on the disk.
 
         :param history: the state.
-        :param ticket: its number; a state is skipped once a later ticket was issued.
-        :raises JournalError: if it cannot be written; the previous state stays on the disk.
         """
+        self._newest += 1
+        return partial(self._save, history, self._newest)
+
+    def _save(self, history: GainsHistory, ticket: int) -> None:
         document = {"version": _VERSION, "loop": self._loop, **_values_of(history)}
         text = json.dumps(document, indent=1, allow_nan=False) + "\n"
         new = self.path.with_suffix(".tmp")
@@ -334,7 +335,7 @@ class GainsKeeper:
         wanted = self.history.edit(gains)
         if wanted is not self.history:
             # In this thread, since a parameter is set as soon as this returns.
-            self._writing(wanted)()
+            self._journal.saving(wanted)()
             self.history = wanted
 
     # Proof.
@@ -491,13 +492,9 @@ class GainsKeeper:
 
     # The disk.
 
-    def _writing(self, history: GainsHistory) -> Callable[[], None]:
-        ticket = self._journal.ticket()
-        return lambda: self._journal.save(history, ticket)
-
     def _write(self, history: GainsHistory) -> None:
         try:
-            self._writing(history)()
+            self._journal.saving(history)()
         except RelayAutotuneError as error:
             self._node.get_logger().error(str(error))
 
@@ -506,7 +503,7 @@ class GainsKeeper:
 
         :raises JournalError: if it cannot be written.
         """
-        await self._node.computed(self._writing(history))
+        await self._node.computed(self._journal.saving(history))
 
     async def _kept(self, history: GainsHistory) -> str:
         try:

@@ -39,7 +39,7 @@ from relay_autotune.nodes.gains_keeper import GainsJournal
 journal = GainsJournal(Path(sys.argv[1]), "/c", 0, "y", "u")
 print("ready", flush=True)
 for k in range(10**9):
-    journal.save(GainsHistory.begun(GainSet.of({"kc": k + 1.0, "ti": k + 1.0})), journal.ticket())
+    journal.saving(GainsHistory.begun(GainSet.of({"kc": k + 1.0, "ti": k + 1.0})))()
 """
 
 
@@ -83,7 +83,7 @@ def journal_in(
 def test_what_is_read_is_what_was_written(tmp_path):
     journal = journal_in(tmp_path / "made" / "folder")
     assert journal.load() is None
-    journal.save(HISTORY, journal.ticket())
+    journal.saving(HISTORY)()
     assert HISTORY.work is Work.VERIFY
     assert HISTORY.failed == (OTHER,)
     assert journal.load() == HISTORY
@@ -104,7 +104,7 @@ def test_each_node_and_each_loop_has_its_own(tmp_path):
 
 def test_a_loop_finds_its_file_of_before_loops_were_in_the_name(tmp_path):
     before = journal_in(tmp_path)
-    before.save(HISTORY, before.ticket())
+    before.saving(HISTORY)()
     before.close()
     before.path.rename(tmp_path / "gains.tank.c.json")
     # Another loop leaves it alone, however often.
@@ -114,7 +114,7 @@ def test_a_loop_finds_its_file_of_before_loops_were_in_the_name(tmp_path):
         other.close()
     journal = journal_in(tmp_path)
     assert journal.load() == HISTORY
-    journal.save(replace(HISTORY, given=None), journal.ticket())
+    journal.saving(replace(HISTORY, given=None))()
     assert journal.load() == replace(HISTORY, given=None)
 
 
@@ -146,9 +146,9 @@ def test_a_second_process_is_refused_and_a_killed_one_leaves_a_whole_file(tmp_pa
 
 def test_a_state_that_was_overtaken_is_left_out(tmp_path):
     journal = journal_in(tmp_path)
-    early, late = journal.ticket(), journal.ticket()
-    journal.save(HISTORY, late)
-    journal.save(replace(HISTORY, given=None), early)
+    early, late = journal.saving(replace(HISTORY, given=None)), journal.saving(HISTORY)
+    late()
+    early()
     assert journal.load() == HISTORY
 
 
@@ -183,7 +183,7 @@ def test_a_file_that_is_no_journal_is_refused(tmp_path, text):
 
 def test_the_journal_of_another_loop_is_refused(tmp_path):
     journal = journal_in(tmp_path)
-    journal.save(HISTORY, journal.ticket())
+    journal.saving(HISTORY)()
     other = GainsJournal.__new__(GainsJournal)
     other.__dict__.update(journal.__dict__, _loop="/z")
     with pytest.raises(JournalError, match="of the loop 'y', found '/z'"):
@@ -194,7 +194,7 @@ def test_a_folder_that_cannot_be_written_is_said(tmp_path):
     (tmp_path / "file").write_text("")
     journal = journal_in(tmp_path / "file")
     with pytest.raises(JournalError, match="cannot be kept in"):
-        journal.save(HISTORY, journal.ticket())
+        journal.saving(HISTORY)()
 
 
 def test_the_present_limits_hold_for_gains_that_were_proven_before(tmp_path):
@@ -205,7 +205,7 @@ def test_the_present_limits_hold_for_gains_that_were_proven_before(tmp_path):
         (GainBounds(kc_max=2.0), own(0.3)),
         (GainBounds(ti_min=0.6), own(0.3)),
     ):
-        journal.save(proven, journal.ticket())
+        journal.saving(proven)()
         history = keeper_of(journal, given, bounds, OwnGains).history
         assert history.gains == GainSet.of(kept)
 
