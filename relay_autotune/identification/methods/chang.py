@@ -39,6 +39,7 @@ from relay_autotune.identification.limit_cycle.limit_cycle import (
     SymmetricCycle,
     relay_test,
 )
+from relay_autotune.identification.limit_cycle.shape import shape_of_record
 from relay_autotune.identification.methods.lags import (
     EXACT,
     FIRST,
@@ -59,11 +60,6 @@ from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.structures import Structure, equal_lags
 from relay_autotune.record.record import Record
 
-# Least jump of the rate at a sharp edge, relative to its largest value: that of one lag jumps by
-# more than 1 where the command arrives.
-_JUMP = 0.6
-_BESIDE = 0.01
-
 
 def read_dead_time(test: RelayTest, known: Known) -> tuple[float, float, str]:
     """Return the dead time that is known, or read it from the record.
@@ -81,7 +77,7 @@ def read_dead_time(test: RelayTest, known: Known) -> tuple[float, float, str]:
     if not math.isnan(known.dead_time):
         return known.dead_time, 0.0, ""
     settings, cycles = test.settings, test.cycle.cycles
-    if _is_sharp(fold(test.record, cycles)):
+    if _is_sharp(test):
         edge = Reading.of(test.record, cycles, lambda seen: np.array([seen.edge]))
         value = max(float(edge.values[0]) - settings.extra_delay, 0.0)
         source = (
@@ -106,14 +102,13 @@ def read_dead_time(test: RelayTest, known: Known) -> tuple[float, float, str]:
     return value, interval / math.sqrt(12.0), source
 
 
-def _is_sharp(curve: Fold) -> bool:
-    if math.isnan(curve.edge):
+def _is_sharp(test: RelayTest) -> bool:
+    """Return whether the averaged half cycles have an edge, and the peak of one lag there."""
+    try:
+        shape = shape_of_record(test.record)
+    except IdentificationError:
         return False
-    beside = _BESIDE * 0.5 * curve.period
-    before, after = curve.slope(np.array((curve.edge - beside, curve.edge + beside)))
-    # Away from the edges, where a spline in noise has its largest rates.
-    steepest = np.abs(curve.slope(np.linspace(0.0, curve.period, 101)))
-    return bool(abs(after - before) > _JUMP * float(np.percentile(steepest, 90.0)))
+    return not math.isnan(fold(test.record, test.cycle.cycles).edge) and shape.category == "1a"
 
 
 def _first_response(test: RelayTest) -> tuple[float, float]:
