@@ -157,6 +157,7 @@ FLAT = 0.42
 
 _GRID = 2001
 _SHARP_FOPDT = 0.2
+_NEARLY_ONE = 1.0 - 1e-14
 
 
 class Curve(Protocol):
@@ -224,18 +225,36 @@ class Shape:
         return "1b" if self.plateau > FLAT else "3"
 
 
-def _widened(shape: Shape) -> float:
-    """How much larger q is for the unstable FOPDT through this peak than for a stable one."""
-    ratio, e = shape.time_to_peak / shape.half_period, shape.level / shape.amplitude
-    if not (abs(e) < 1.0 and 0.0 < ratio < 0.5 * (1.0 - e)):
-        return 1.0
+def relative_amplitude(time_to_peak: float, half_period: float, level: float) -> float:
+    """Return a/(K h) of the FOPDT process that peaks at a time, negative for an unstable one.
+
+    With v = a/(K h), P/(2 tau) is 2 atanh v, so that D over half the period is a function of v
+    alone that rises from 0 at -1, by (1 - epsilon/a)/2 at 0, to 1 at 1 (Thyagarajan and Yu 2003,
+    eqs 10, 11, 16 and 17).
+
+    :param time_to_peak: from the switch to the peak, which is D [s].
+    :param half_period: P/2 [s].
+    :param level: epsilon/a, between -1 and 1.
+    :return: NaN: no such process peaks then.
+    """
+    share = time_to_peak / half_period
 
     def excess(v: float) -> float:
-        return math.log((1.0 + v) / (1.0 + e * v)) / (2.0 * math.atanh(v)) - ratio
+        if abs(v) < 1e-12:
+            return 0.5 * (1.0 - level) - share
+        return (math.log1p(-level * v) - math.log1p(-v)) / (2.0 * math.atanh(v)) - share
 
-    if excess(1.0 - 1e-12) > 0.0:
+    if not (abs(level) < 1.0 and excess(-_NEARLY_ONE) <= 0.0 <= excess(_NEARLY_ONE)):
+        return math.nan
+    return float(brentq(excess, -_NEARLY_ONE, _NEARLY_ONE, xtol=1e-16, rtol=1e-15))
+
+
+def _widened(shape: Shape) -> float:
+    """How much larger q is for the unstable FOPDT through this peak than for a stable one."""
+    level = shape.level / shape.amplitude
+    v = -relative_amplitude(shape.time_to_peak, shape.half_period, level)
+    if not v > 0.0:
         return 1.0
-    v = float(brentq(excess, 1e-9, 1.0 - 1e-12))
     # From the peak the deviation falls as 1/v - (1/v - 1) exp(t/tau), in units of a.
     to_tenth, to_half = (math.log((1.0 - x * v) / (1.0 - v)) for x in (0.9, 0.5))
     return max(to_tenth / to_half / _SHARP_FOPDT, 1.0)

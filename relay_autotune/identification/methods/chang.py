@@ -32,7 +32,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.experiment.settling import NOT_SETTLED, ResponseDetector
 from relay_autotune.identification.known import NOTHING, Known
-from relay_autotune.identification.limit_cycle.fold import Fold, Reading, fold
+from relay_autotune.identification.limit_cycle.fold import Reading, fold
 from relay_autotune.identification.limit_cycle.limit_cycle import (
     MOST_LEVEL,
     RelayTest,

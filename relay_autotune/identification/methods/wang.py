@@ -51,6 +51,7 @@ from relay_autotune.identification.limit_cycle.fourier import (
     steady_state,
 )
 from relay_autotune.identification.limit_cycle.limit_cycle import relay_test
+from relay_autotune.identification.limit_cycle.shape import relative_amplitude
 from relay_autotune.identification.methods.solved import solved
 from relay_autotune.identification.result import Identification
 from relay_autotune.process.structures import FOPDT
@@ -60,7 +61,6 @@ from relay_autotune.record.record import Record
 INTEGRATOR_RATIO = 0.5 * math.pi
 # Ends of q for a stable process.
 _SMALLEST_Q, _LARGEST_Q = 2.5e-5, 300.0
-_NEARLY_ONE = 1.0 - 1e-14
 _INTEGRATING = 1e-9
 
 Fopdt = tuple[float, float, float]
@@ -205,9 +205,6 @@ def fopdt(
 ) -> Fopdt:
     """Return the process of a given dead time (eqs 10, 11, 16, 17 of Thyagarajan and Yu).
 
-    With v = a/(K h), negative for an unstable process, P/(2 tau) = 2 atanh v, so that 2 D/P is a
-    function of v alone that rises from 0 at -1, by (1 - epsilon/a)/2 at 0, to 1 at 1.
-
     :param period: P [s].
     :param amplitude: a [y].
     :param time_to_peak: from the switch to the peak, which is D [s].
@@ -217,31 +214,25 @@ def fopdt(
     :raises IdentificationError: unless (1 - epsilon/a) P/4 < D < P/2 for a stable process,
         0 < D < (1 - epsilon/a) P/4 for an unstable one.
     """
-    e, share = level / amplitude, 2.0 * time_to_peak / period
-    earliest = 0.25 * period * (1.0 - e)
+    e, half = level / amplitude, 0.5 * period
     if not abs(e) < 1.0:
         raise IdentificationError(
             f"a period of {period:g} s with an amplitude of {amplitude:g} about a switching level "
             f"of {level:g} is no limit cycle: the amplitude must exceed the level"
         )
-
-    def excess(v: float) -> float:
-        if abs(v) < 1e-12:
-            return 0.5 * (1.0 - e) - share
-        return (math.log1p(-e * v) - math.log1p(-v)) / (2.0 * math.atanh(v)) - share
-
-    if not excess(-_NEARLY_ONE) <= 0.0 <= excess(_NEARLY_ONE):
+    v = relative_amplitude(time_to_peak, half, e)
+    if math.isnan(v):
         raise IdentificationError(
             f"a peak {time_to_peak:g} s after the switch does not lie within the half period of "
-            f"{0.5 * period:g} s, or at its very end: no FOPDT process has a lag that shows there"
+            f"{half:g} s, or at its very end: no FOPDT process has a lag that shows there"
         )
-    v = float(brentq(excess, -_NEARLY_ONE, _NEARLY_ONE, xtol=1e-16, rtol=1e-15))
     side = -1.0 if unstable else 1.0
     if side * v <= _INTEGRATING:
         kind, eq = ("unstable", "eq 16") if unstable else ("stable", "eq 10")
+        quarter = 0.5 * half * (1.0 - e)
         raise IdentificationError(
             f"the peak comes {time_to_peak:g} s after the switch, and (1 - epsilon/a) P/4 is "
-            f"{earliest:g} s: no {kind} FOPDT process does that ({eq}); an unstable one peaks "
+            f"{quarter:g} s: no {kind} FOPDT process does that ({eq}); an unstable one peaks "
             "before, a stable one after, and an integrator just then"
         )
     gain, tau, _ = first_order(math.atanh(v), period, amplitude, relay, level)
