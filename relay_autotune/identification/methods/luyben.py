@@ -137,7 +137,7 @@ def identify_step(record: Record, known: Known = NOTHING) -> Identification:
     """
     structure_asked_for(METHOD, known, (INTEGRATOR_INVERSE,))
     test = step_test(record)
-    noise = _noise(test, record.noise_std)
+    noise = record.noise
     reading, end = _read_curve(test, _return_time(test, noise), known.dead_time)
     found = solved(
         *(METHOD, INTEGRATOR_INVERSE),
@@ -209,13 +209,6 @@ def step_test(record: Record) -> StepTest:
             f"{_LEAST_SAMPLES} samples between: {METHOD} needs one step and its whole response"
         )
     return StepTest(begin, float(u.values[k]) - before, time[part], record.measurement[part])
-
-
-def _noise(test: StepTest, known: float) -> float:
-    before = test.y[test.time <= test.begin]
-    if before.size >= _LEAST_SAMPLES:
-        return float(np.std(before, ddof=1))
-    return 0.0 if math.isnan(known) else known
 
 
 def _return_time(test: StepTest, noise: float) -> float:
