@@ -28,7 +28,7 @@ from relay_autotune.identification.limit_cycle.fold import Fold, Reading, fold
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.record.cycles import cycles_of, limit_cycle, settings_of
 from relay_autotune.record.record import Record, cached_on_record
-from relay_autotune.scalar import minimum_near
+from relay_autotune.scalar import minimum_near, root
 
 _LEAST_PEAKS = 6
 _QUICKEST = 0.1
@@ -293,11 +293,14 @@ def shape_of_curve(
     a = max(_at(y, peak), float(values[top]))
     if not math.isnan(edge) and _at(y, edge) >= a - tolerance:
         peak, a = edge, _at(y, edge)
-    before = np.linspace(peak - period, peak, _GRID)
-    after = np.linspace(peak, peak + period, _GRID)
-    zero = _crossing(y, 0.0, before[::-1])
-    half = _crossing(y, 0.5 * a, before[::-1])
-    tenth_down, half_down = _crossing(y, 0.9 * a, after), _crossing(y, 0.5 * a, after)
+
+    def falls(side: float, *shares: float) -> list[float]:
+        path = peak + side * grid
+        heights = y(path)
+        return [_crossing(y, share * a, path, heights) for share in shares]
+
+    zero, half, tenth = falls(-1.0, 0.0, 0.5, 0.9)
+    half_down, tenth_down = falls(1.0, 0.5, 0.9)
     return Shape(
         half_period=half_period,
         amplitude=a,
@@ -306,7 +309,7 @@ def shape_of_curve(
         rise=peak - zero,
         rise_half=half - zero,
         sharpness=(tenth_down - peak) / (half_down - peak),
-        plateau=(tenth_down - _crossing(y, 0.9 * a, before[::-1])) / half_period,
+        plateau=(tenth_down - tenth) / half_period,
         growth=growth,
     )
 
@@ -326,24 +329,18 @@ def _turning_point(y: Curve, low: float, high: float) -> float:
     return float(brentq(rate, low, high, xtol=1e-15 * (high - low), rtol=1e-15))
 
 
-def _crossing(y: Curve, level: float, path: FloatArray) -> float:
+def _crossing(y: Curve, level: float, path: FloatArray, heights: FloatArray) -> float:
     """Where the curve first falls to a level along a path that begins above it."""
-    below = np.flatnonzero(y(path) <= level)
+    below = np.flatnonzero(heights <= level)
     if below.size == 0 or below[0] == 0:
         raise IdentificationError(
             f"the measurement does not fall to {level:g} beside its peak within half a period: "
             "the oscillation does not pass its set-point both ways"
         )
     i = int(below[0])
-
-    def excess(t: float) -> float:
-        return _at(y, t) - level
-
-    a, b = sorted((float(path[i - 1]), float(path[i])))
-    if excess(a) * excess(b) >= 0.0:
-        return a
     # A crossing may lie at zero, where no relative accuracy would do.
-    return float(brentq(excess, a, b, xtol=1e-15 * abs(float(path[-1] - path[0])), rtol=1e-15))
+    accuracy = 1e-15 * abs(float(path[-1] - path[0]))
+    return root(lambda t: _at(y, t) - level, float(path[i - 1]), float(path[i]), accuracy)
 
 
 def shape_of_half_cycle(cycle: HalfCycle) -> Shape:
