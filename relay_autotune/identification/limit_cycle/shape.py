@@ -28,7 +28,7 @@ from relay_autotune.identification.limit_cycle.fold import Fold, Reading, fold
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.record.cycles import cycles_of, limit_cycle, settings_of
 from relay_autotune.record.record import Record, cached_on_record
-from relay_autotune.scalar import minimum_near, root
+from relay_autotune.scalar import minimum_near, roots
 
 _LEAST_PEAKS = 6
 _QUICKEST = 0.1
@@ -156,6 +156,7 @@ SLOW = 1.0
 FLAT = 0.42
 
 _GRID = 2001
+_PARTS = np.linspace(0.0, 1.0, _GRID)
 _SHARP_FOPDT = 0.2
 _NEARLY_ONE = 1.0 - 1e-14
 
@@ -281,7 +282,7 @@ def shape_of_curve(
         pass zero on both sides of its peak.
     """
     period = half_period
-    grid = np.linspace(0.0, period, _GRID)
+    grid = period * _PARTS
     values = y(grid)
     top = int(np.argmax(values))
     if not values[top] > 0.0:
@@ -295,9 +296,18 @@ def shape_of_curve(
         peak, a = edge, _at(y, edge)
 
     def falls(side: float, *shares: float) -> list[float]:
-        path = peak + side * grid
-        heights = y(path)
-        return [_crossing(y, share * a, path, heights) for share in shares]
+        """Return where the curve first falls to shares of the peak, on one side of it."""
+        levels, reach = a * np.array(shares), side * period
+        below = y(peak + reach * _PARTS)[:, None] <= levels
+        first = np.argmax(below, axis=0)
+        if not np.all(first):
+            raise IdentificationError(
+                f"the measurement does not fall to {levels[first == 0][0]:g} beside its peak "
+                "within half a period: the oscillation does not pass its set-point both ways"
+            )
+        ends = _PARTS[first - 1], _PARTS[first]
+        parts = roots(lambda part: y(peak + reach * part) - levels, *ends)
+        return (peak + reach * parts).tolist()
 
     zero, half, tenth = falls(-1.0, 0.0, 0.5, 0.9)
     half_down, tenth_down = falls(1.0, 0.5, 0.9)
@@ -327,20 +337,6 @@ def _turning_point(y: Curve, low: float, high: float) -> float:
     if not rate(low) > 0.0 > rate(high):
         return low if rate(low) <= 0.0 else high
     return float(brentq(rate, low, high, xtol=1e-15 * (high - low), rtol=1e-15))
-
-
-def _crossing(y: Curve, level: float, path: FloatArray, heights: FloatArray) -> float:
-    """Where the curve first falls to a level along a path that begins above it."""
-    below = np.flatnonzero(heights <= level)
-    if below.size == 0 or below[0] == 0:
-        raise IdentificationError(
-            f"the measurement does not fall to {level:g} beside its peak within half a period: "
-            "the oscillation does not pass its set-point both ways"
-        )
-    i = int(below[0])
-    # A crossing may lie at zero, where no relative accuracy would do.
-    accuracy = 1e-15 * abs(float(path[-1] - path[0]))
-    return root(lambda t: _at(y, t) - level, float(path[i - 1]), float(path[i]), accuracy)
 
 
 def shape_of_half_cycle(cycle: HalfCycle) -> Shape:
