@@ -8,7 +8,6 @@
 A page asks for it with a pair of comments, and what is between them is replaced:
 
     <!-- parameters of relay_node -->    <!-- end -->    a table of the node's parameters
-    <!-- text of FILE -->                <!-- end -->    a file, in a fenced block
     <!-- checks of judgement -->         <!-- end -->    the table of checks behind a verdict
     <!-- laws of equations -->           <!-- end -->    a table of the laws that gains are for
     <!-- reasons of 300 -->              <!-- end -->    a table of the reasons of 300 to 399
@@ -49,6 +48,13 @@ TABLES: Mapping[str, Sequence[Quantity]] = {
     "controller_node": CONTROLLER_PARAMETERS,
 }
 
+# Where the names stand that a parameter may take, too many for a cell.
+_NAMES = {
+    "law": "laws.md#the-laws",
+    "rule": "rules.md",
+    "method": "methods.md",
+    "structure": "plant.md#the-process",
+}
 _BLOCK = re.compile(
     r"<!-- (?P<kind>parameters|text|checks|laws|reasons) of (?P<what>\S+) -->\n.*?<!-- end -->",
     re.DOTALL,
@@ -60,7 +66,6 @@ def filled(page: str) -> str:
 
     :param page: the text of the page.
     :raises KeyError: if it asks for the parameters of a node that is not known here.
-    :raises OSError: if it asks for a file that cannot be read.
     """
     return _BLOCK.sub(_block, page)
 
@@ -69,7 +74,6 @@ def _block(asked: re.Match[str]) -> str:
     what = asked["what"]
     kinds: dict[str, Callable[[str], str]] = {
         "parameters": lambda name: table(TABLES[name]),
-        "text": text_of,
         "checks": lambda _: checks_table(CHECKS),
         "laws": laws_table,
         "reasons": lambda first: reasons_table(int(first)),
@@ -93,6 +97,8 @@ def table(entries: Iterable[Quantity]) -> str:
 
 def _short(entry: Quantity) -> str:
     """Return the range of a parameter without its unit; empty: any number."""
+    if entry.name in _NAMES:
+        return f"[a name]({_NAMES[entry.name]})"
     text = entry.range_text.replace(f" [{entry.unit}]", "").replace(" where it is not given", "")
     text = text.replace(f" {entry.unit},", ",").removesuffix(f" {entry.unit}")
     return "" if text.startswith("any number") else text
@@ -212,14 +218,6 @@ def default_text(default: object) -> str:
     return f"`{default}`"
 
 
-def text_of(name: str) -> str:
-    """Return a file of the repository in a fenced block.
-
-    :param name: its path from the repository's root.
-    """
-    return f"```text\n{(ROOT / name).read_text().rstrip()}\n```"
-
-
 def parameter_file() -> str:
     """Return a parameter file with every parameter of every node at its default."""
     lines = [
@@ -256,7 +254,6 @@ def yaml_value(value: object) -> str:
 
 def main() -> int:
     """Fill all pages, and write the files that follow from the code."""
-    # The pages have the text of the first two.
     written: list[tuple[Path, Callable[[], str]]] = [
         (PARAMETER_FILE, parameter_file),
         (REASON_FILE, reason_file),
