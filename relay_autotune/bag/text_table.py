@@ -38,6 +38,10 @@ _FIRST = 64 << 10
 _LONGEST_HEAD = 1000
 # Largest share of rows with text in place of a number that are left out; more are a fault.
 _DAMAGED = 0.02
+_COMMAS = (
+    ": where commas separate columns, a number has none; save the table with decimal points and "
+    "without separators of thousands, or with semicolons between columns"
+)
 _MISSING = frozenset(("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--"))
 _SWITCH = {"on": 1.0, "off": 0.0, "true": 1.0, "false": 0.0}
 _QUANTITY = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*(%|[^\W\d_/]{1,4}|\u00b0\w?)")
@@ -157,10 +161,14 @@ class TextTable:
             names = [str(number) for number in range(1, width + 1)]
             why = "there is no header line"
             if above and not _is_data(above[-1][1]) and sum(map(bool, above[-1][1])) > width // 2:
+                count = len(above[-1][1])
                 why = (
-                    f"line {above[-1][0]} has {len(above[-1][1])} names and the rows have {width} "
-                    "cells, so that it does not tell which is which"
+                    f"line {above[-1][0]} has {count} names and the rows have {width} cells, so "
+                    "that it does not tell which is which"
                 )
+                if self._separator == "," and width == 2 * count - 1:
+                    # Each number but the time stands in two cells.
+                    raise BagError(f"{self._path}: {why}{_COMMAS}")
             self.notes.append(f"{why}; the columns are called {listed(names)}")
             return names
         line, cells = above[-1]
@@ -352,12 +360,8 @@ class TextTable:
 
     def _no_number(self, line: int, at: int, cell: str, *, finite: bool = False) -> BagError:
         shown = cell if finite else repr(visible(cell))
-        hint = ""
-        if self._separator == "," and _is_number(cell.replace(",", "")) and "," in cell:
-            hint = (
-                ": where commas separate columns, a number has none; save the table with decimal "
-                "points and without separators of thousands, or with semicolons between columns"
-            )
+        between = self._separator == "," and "," in cell and _is_number(cell.replace(",", ""))
+        hint = _COMMAS if between else ""
         return BagError(
             f"{self._path}, line {line}: {self.names[at]!r} is {shown}; expected a "
             f"{'finite ' if finite else ''}number{hint}"

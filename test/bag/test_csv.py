@@ -483,6 +483,12 @@ def test_a_comma_within_a_number_between_commas_is_told(tmp_path, cell):
         read_experiments(write(tmp_path / "a.csv", f"t,y,u\n{rows}"))
 
 
+def test_a_decimal_comma_that_makes_two_cells_is_told(tmp_path):
+    rows = "\n".join(f"{k},75,{k},45,00" for k in range(9))
+    with pytest.raises(BagError, match=r"3 names and the rows have 5 cells.*commas separate"):
+        read_experiments(write(tmp_path / "a.csv", f"t,PV,CO\n{rows}"))
+
+
 def test_two_columns_of_one_name_have_to_be_renamed(tmp_path):
     text = "t,PV,PV,CO\n" + "\n".join(line(k).replace(",", ",1,", 1) for k in range(20))
     with pytest.raises(SelectionError, match=r"2 columns named 'PV'.*change them in its header"):
