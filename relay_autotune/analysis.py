@@ -273,6 +273,7 @@ class _Tuning:
             simple=self.simple,
             models=models,
             describing=_describing_point(found),
+            recorded_period=_clock_of(found.record),
         )
 
 
@@ -392,7 +393,7 @@ def _judged(
         chosen = replace(chosen, warnings=(*chosen.warnings, told))
         found = replace(found, models=(chosen, *found.models[1:]))
     found = replace(found, shaping=shaping)
-    tuned = _tuned(found, shaping.task, tuning)
+    tuned = _tuned(found, shaping.task, tuning.rules)
     gains = tuned.best_gains
     if gains is None:
         return replace(tuned, judgement=replace(judgement, refused=tuned.reason))
@@ -435,9 +436,8 @@ def _simple(
     return found.model
 
 
-def _tuned(found: Analysis, task: DesignTask, tuning: _Tuning) -> Analysis:
+def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
     """Add the gains of the rules that apply to the selected model; the first rule must apply."""
-    rules = tuning.rules
     try:
         first = design(task, rules[0])
     except TuningError as error:
@@ -450,9 +450,6 @@ def _tuned(found: Analysis, task: DesignTask, tuning: _Tuning) -> Analysis:
             # Skip a rule that does not apply: it is only for comparison.
             continue
     delay = task.options.added_delay
-    if task.options.sample_period and not tuning.task.options.sample_period:
-        told = ", the interval of the recording; --sample-period names another"
-        gains = [replace(each, reason=each.reason + told) for each in gains]
     return replace(found, gains=tuple(gains), recommended=0, added_delay=delay)
 
 
@@ -469,10 +466,15 @@ def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
         # Without relay settings: half of the command's range.
         settings, half = record.settings, 0.5 * float(np.ptp(record.command))
         options = replace(options, amplitude=half if settings is None else abs(settings.amplitude))
-    if options.sample_period == 0.0 and len(record) > 1:
-        # Further digits are jitter of the stamps, and no program is set to them.
-        options = replace(options, sample_period=float(f"{_sampling_period(record):.3g}"))
+    if options.sample_period == 0.0:
+        options = replace(options, sample_period=_clock_of(record))
     return options
+
+
+def _clock_of(record: Record) -> float:
+    """Return the time between samples without the jitter of the stamps [s]; 0: there is none."""
+    # No program is set to further digits.
+    return float(f"{_sampling_period(record):.3g}")
 
 
 def _unseen(record: Record, options: DesignOptions) -> float:

@@ -179,6 +179,8 @@ def judged(task: DesignTask, found: Designed) -> Gains:
         warnings += unstable
         if options.sample_period:
             reason += f"; for a controller that runs every {options.sample_period:g} s"
+    if 0.0 < options.sample_period == task.recorded_period:
+        reason += ", the interval of the recording; --sample-period names another"
     if 0.0 < controller.ti < task.options.sample_period:
         # What it integrates in one sample is more than its proportional part.
         reason += (

@@ -136,6 +136,7 @@ class DesignTask:
     :param models: models within the uncertainty; empty: the uncertainty is not known.
     :param describing: K_u and w_u by the describing function from the limit cycle; None: not
         known.
+    :param recorded_period: interval of the recording [s]; 0: there is none.
     """
 
     model: TransferFunction
@@ -143,6 +144,7 @@ class DesignTask:
     simple: TransferFunction | None = None
     models: tuple[TransferFunction, ...] = ()
     describing: UltimatePoint | None = None
+    recorded_period: float = 0.0
 
     def in_loop(self, model: TransferFunction) -> TransferFunction:
         """Return a process with the dead time that the loop adds to it.
