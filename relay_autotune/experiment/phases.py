@@ -469,7 +469,7 @@ def how_long(
         settles = f"{duration(least)} or more" if least > 0.0 else "some time"
         settles += f" until the measurement is steady, {duration(limit)} at most"
     usual = parameters.min_cycles + _USUAL_EXTRA + from_small * SMALL_CYCLES
-    told = f"it takes {settles}, then one step and about {usual} oscillations of the loop"
+    sentence = f"it takes {settles}, then one step and about {usual} oscillations of the loop"
     if parameters.max_duration > 0.0:
-        return f"{told}, {duration(parameters.max_duration)} at most in all"
-    return told
+        return f"{sentence}, {duration(parameters.max_duration)} at most in all"
+    return sentence

@@ -41,9 +41,9 @@ from relay_autotune.nodes.gains_place import (
     Place,
     RemoteGains,
     RemoteLoop,
+    controller_text,
     mapping_of,
     reported_by,
-    said,
 )
 from relay_autotune.nodes.goals import serve
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
@@ -215,11 +215,12 @@ class ControllerNode(ServedNode):
         if self._remote is None and self._keeper.history.gains != given:
             self._use(self._keeper.history.gains)
             self.get_logger().warning(
-                f"starts with {said(self._pid.gains)}, not with the parameters' {said(gains)}, "
-                f"for what was proven or failed before: see {journal.path}"
+                f"starts with {controller_text(self._pid.gains)}, not with the parameters' "
+                f"{controller_text(gains)}, for what was proven or failed before: see "
+                f"{journal.path}"
             )
         self.get_logger().info(
-            f"ready: {said(self._pid.gains)}, "
+            f"ready: {controller_text(self._pid.gains)}, "
             f"{'automatic' if self._pid.is_automatic else 'holding its command'}; "
             f"commands go to {self._commands.topic_name}, held until somebody subscribes to it; "
             f"set-points come on {self.resolve_topic_name('setpoint')}"
@@ -378,7 +379,7 @@ class ControllerNode(ServedNode):
         cut_short = not self._keeper.history.is_open_to(self._place.set_of(gains))
         if self._doubt or cut_short or not asked:
             self.get_logger().info(
-                f"gains of {name} wait: {said(gains)}; call "
+                f"gains of {name} wait: {controller_text(gains)}; call "
                 f"{self.get_fully_qualified_name()}/apply or /discard"
                 + (
                     "; their verification was cut short, so that auto_apply leaves them"

@@ -338,14 +338,14 @@ class GainsClient(LoopClient):
                 "nobody controls the loop; started again, it begins with the gains that were "
                 "proven, or with those of its parameters"
             )
-        told = ", ".join(f"{name} {value:.6g}" for name, value in before.items())
+        gains = ", ".join(f"{name} {value:.6g}" for name, value in before.items())
         with suppress(LoopError):
             if self.values(target, list(before)) != before:
                 put_gains(self, target, before, before)
-            return f"{target} has {told}, as before{self.left_behind}"
+            return f"{target} has {gains}, as before{self.left_behind}"
         return (
             f"{target} may have the new gains, which are not proven: start {self.name} again, "
-            f"which brings {told} back"
+            f"which brings {gains} back"
         )
 
     def steps_of(self, result: Any) -> list[Any]:

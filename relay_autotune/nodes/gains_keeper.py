@@ -313,7 +313,7 @@ class GainsKeeper:
             await self._change(now, now.apply(gains))
             self.history = self.history.settled()
             kept = await self._kept(self.history)
-        return f"{self._place.said(gains)}{kept}"
+        return f"{self._place.sentence(gains)}{kept}"
 
     async def revert(self) -> str:
         """Return to the previous whole set, and return a sentence for the user.
@@ -323,7 +323,7 @@ class GainsKeeper:
         with self._alone():
             now = self._permitted()
             await self._change(now, now.revert())
-        return f"{self._place.said(self.history.gains)} again"
+        return f"{self._place.sentence(self.history.gains)} again"
 
     def edit(self, gains: GainSet | None) -> None:
         """Note gains that are set by hand, before they are in force.
@@ -371,7 +371,7 @@ class GainsKeeper:
         # Gains before journal: the journal already marks these gains as not trusted.
         self._goal, self._anothers = goal, False
         await self._settle()
-        return self._open() or f"; {self._place.said(self.history.gains)} again"
+        return self._open() or f"; {self._place.sentence(self.history.gains)} again"
 
     async def abandon(self) -> None:
         """Undo an unfinished change, before the end of the process, if the gains outlive it."""
@@ -488,7 +488,7 @@ class GainsKeeper:
         finally:
             self._busy = False
         if not self._open():
-            self._node.get_logger().info(f"{self._place.said(self.history.gains)} again")
+            self._node.get_logger().info(f"{self._place.sentence(self.history.gains)} again")
 
     # The disk.
 

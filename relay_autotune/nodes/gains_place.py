@@ -231,14 +231,14 @@ class OwnGains(_Place):
         """Put gains in force, or hold the command."""
         self._use(gains)
 
-    def said(self, gains: GainSet | None) -> str:
+    def sentence(self, gains: GainSet | None) -> str:
         """Say which gains are in force."""
         if gains is None:
             return "no gains are in force, the command is held"
-        return f"{said(self.controller_of(gains))} in force"
+        return f"{controller_text(self.controller_of(gains))} in force"
 
 
-def said(gains: Controller | None) -> str:
+def controller_text(gains: Controller | None) -> str:
     """Return gains in words."""
     if gains is None:
         return "no gains"
@@ -288,7 +288,7 @@ class RemoteGains(_Place):
             )
         self._rate = rate_of(gains.law, gains.law_period)
 
-    def said(self, gains: GainSet | None) -> str:
+    def sentence(self, gains: GainSet | None) -> str:
         """Say which gains are in force."""
         if gains is None:
             return f"{self.name} keeps its gains, since no earlier gains are known: check them"
@@ -344,8 +344,8 @@ Place = OwnGains | RemoteGains
 """Where gains act.
 
 ``require_law`` refuses gains for a law that does not run there; ``read`` returns those in force if
-another node may have changed them, else None; ``put`` applies gains, all or none; ``said`` tells
-which are in force. All but the last raise RelayAutotuneError.
+another node may have changed them, else None; ``put`` applies gains, all or none; ``sentence``
+tells which are in force. All but the last raise RelayAutotuneError.
 """
 
 # A controller without a command for this time counts as silent [s].

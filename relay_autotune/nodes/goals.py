@@ -265,11 +265,11 @@ class TuneAction(OneGoal):
         result.why = summary.why
         result.reason = "; ".join(filter(None, (summary.reason, missing)))
         given = bool(result.gains.experiment_id)
-        told = result.gains if given else result.transfer_function
-        result.verdict = told.verdict if given else Tune.Result.VERDICT_NONE
-        result.verdict_reason = told.verdict_reason or ("" if given else result.reason)
-        result.verdict_why = told.verdict_why
-        if not (told.verdict_reason or given):
+        judged = result.gains if given else result.transfer_function
+        result.verdict = judged.verdict if given else Tune.Result.VERDICT_NONE
+        result.verdict_reason = judged.verdict_reason or ("" if given else result.reason)
+        result.verdict_why = judged.verdict_why
+        if not (judged.verdict_reason or given):
             result.verdict_why = result.why
         self.running = None
         conclude(goal, result, succeeded=summary.outcome == Tune.Result.COMPLETED)

@@ -192,9 +192,9 @@ class JointLoop(_Parts):
 
     def _references(self, values: Sequence[float]) -> str:
         rates = [0.0 if math.isfinite(v) and self.has_rate else math.nan for v in values]
-        told = (f"[{', '.join(map(_yaml, numbers))}]" for numbers in (values, rates))
+        columns = (f"[{', '.join(map(_yaml, numbers))}]" for numbers in (values, rates))
         names = json.dumps(list(self.joints))
-        return "{{dof_names: {}, values: {}, values_dot: {}}}".format(names, *told)
+        return "{{dof_names: {}, values: {}, values_dot: {}}}".format(names, *columns)
 
 
 def joint_loop(
@@ -281,13 +281,13 @@ def _of_pid(client: LoopClient, node: str) -> _Parts:
         "feedforward_gain" if feeds and not has_rate else "",
         False,
         "MultiDOFStateStamped",
-        _told_by_pid,
+        _pid_state_of,
     )
 
 
-def _told_by_pid(message: Any, joint: str) -> DofState | None:
-    told = [dof for dof in message.dof_states if dof.name == joint]
-    return DofState(told[0].reference, told[0].feedback, told[0].output) if told else None
+def _pid_state_of(message: Any, joint: str) -> DofState | None:
+    dofs = [dof for dof in message.dof_states if dof.name == joint]
+    return DofState(dofs[0].reference, dofs[0].feedback, dofs[0].output) if dofs else None
 
 
 def _of_trajectories(client: LoopClient, node: str) -> _Parts:
@@ -360,14 +360,14 @@ def _states(client: LoopClient, node: str, parts: _Parts) -> tuple[DofState, ...
         )
     found = []
     for joint in parts.joints:
-        told = [state for m in came if (state := parts.state_of(m, joint)) is not None]
-        if not told:
+        states = [state for m in came if (state := parts.state_of(m, joint)) is not None]
+        if not states:
             raise LoopError(f"{topic} does not tell the state of {joint}")
         found.append(
             replace(
-                told[-1],
-                feedback=sum(each.feedback for each in told) / len(told),
-                output=sum(each.output for each in told) / len(told),
+                states[-1],
+                feedback=sum(each.feedback for each in states) / len(states),
+                output=sum(each.output for each in states) / len(states),
             )
         )
     return tuple(found)

@@ -490,9 +490,9 @@ class LoopClient:
         own = self._resolved(topic)
         if own in found or len(found) == 1:
             return own if own in found else found[0]
-        told = ", ".join(found) or "none"
+        topics = ", ".join(found) or "none"
         raise LoopError(
-            f"the {topic} cannot be shown: {relay} has {told} of {type_name} for it, expected "
+            f"the {topic} cannot be shown: {relay} has {topics} of {type_name} for it, expected "
             f"one; give this command the same -r {topic}:=TOPIC"
         )
 

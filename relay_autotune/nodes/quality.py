@@ -204,8 +204,8 @@ def _problems(ends: Sequence[Any], kind: str, check: Any) -> str:
             continue
         compatibility, reason = check(end.qos_profile)
         if compatibility == QoSCompatibility.ERROR:
-            told = reason.replace("ERROR: ", "").rstrip("; ").replace(";", ", ")
-            problems.append(f"{who(end)} has an incompatible QoS: {told}")
+            mismatch = reason.replace("ERROR: ", "").rstrip("; ").replace(";", ", ")
+            problems.append(f"{who(end)} has an incompatible QoS: {mismatch}")
     return "; ".join(problems)
 
 

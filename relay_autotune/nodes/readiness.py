@@ -272,8 +272,8 @@ class Readiness:
         policy = _policy_from(values, connected=self._loop.is_connected)
         # A feedback of the position, or the controller of a closed loop, also shows where the
         # actuator ends.
-        told = moves_setpoint or self._node.count_publishers("command_feedback") > 0
-        from_small = not (told or parameters.finds_amplitude)
+        shows_ends = moves_setpoint or self._node.count_publishers("command_feedback") > 0
+        from_small = not (shows_ends or parameters.finds_amplitude)
         period = last[1].period if last is not None else math.nan
         return Ready(parameters, baseline, policy, from_small, period)
 

@@ -200,11 +200,11 @@ class Recording:
         if self._timer is not None:
             self._node.destroy_timer(self._timer)
             self._timer = None
-        log, told = self._node.get_logger(), f"the recording {self.path} is closed {why}"
+        log, sentence = self._node.get_logger(), f"the recording {self.path} is closed {why}"
         # A line of code has one severity; with another one the logger raises.
-        self._finished = lambda: log.info(told)
+        self._finished = lambda: log.info(sentence)
         if self._closed is not None and self._missing:
-            self._finished = lambda: log.warning(told)
+            self._finished = lambda: log.warning(sentence)
         self._closing.set()
         if self._closed is not None:
             missing = " and no ".join(self._missing)
@@ -235,8 +235,8 @@ class Recording:
             writer.close()
             self._finished()
         except Exception as error:  # noqa: BLE001  a recorder must not end an experiment
-            told = str(error) or type(error).__name__
-            self.failure = told if self._opened.is_set() else f"not recorded: {told}"
+            problem = str(error) or type(error).__name__
+            self.failure = problem if self._opened.is_set() else f"not recorded: {problem}"
             self._opened.set()
             # Nothing is written after a failure, so the queues are emptied.
             while not self._closing.wait(FLUSH_PERIOD):

@@ -342,8 +342,8 @@ class RelayNode(ServedNode):
         self._alarm = "" if completed else self._summary
         count = session.lost_samples
         lost = str(Code.NOTE_LOST(samples=count)) if count else ""
-        told = "; ".join(filter(None, (experiment.reason, lost)))
-        self.get_logger().info(f"tune {session.id} {outcome}: {told}")
+        sentence = "; ".join(filter(None, (experiment.reason, lost)))
+        self.get_logger().info(f"tune {session.id} {outcome}: {sentence}")
         self._publish_diagnostics()
         if session.sample_count:
             self._results.experiment(message)
@@ -389,11 +389,11 @@ class RelayNode(ServedNode):
             waiting = self._awaits_results
             timeout = self.get_parameter("model_timeout").value
             return "" if waiting is None else waiting.recording.awaited(timeout)
-        told = session.experiment.status
+        sentence = session.experiment.status
         if (age := self._sensor.age) > SILENT:
-            told += f"; no measurement for {duration(age)}"
+            sentence += f"; no measurement for {duration(age)}"
         lost = self._lost()
-        return f"{told}; {Code.NOTE_LOST(samples=lost)}" if lost else told
+        return f"{sentence}; {Code.NOTE_LOST(samples=lost)}" if lost else sentence
 
     def _tell(self, status: str) -> None:
         """Send feedback of the tune that runs, or that waits for its model."""

@@ -115,8 +115,8 @@ def said_by(message: Any) -> tuple[str, bool, str]:
     """
     values = {pair.key: pair.value for pair in message.values}
     working = values.get(_STATE) == _WORKING
-    told = message.message != _WORKING if working else message.level != DiagnosticStatus.OK
-    return values.get(_EXPERIMENT, ""), working, message.message if told else ""
+    has_text = message.message != _WORKING if working else message.level != DiagnosticStatus.OK
+    return values.get(_EXPERIMENT, ""), working, message.message if has_text else ""
 
 
 # Limits on remembered experiments and logged reasons, since a node may send any number.
@@ -146,8 +146,8 @@ class Refusals:
         :param experiment_id: its experiment, according to the message.
         :param error: the reason.
         """
-        told = f"{what} of {experiment_id or 'an experiment without id'} refused: {error}"
-        self.last = told
+        sentence = f"{what} of {experiment_id or 'an experiment without id'} refused: {error}"
+        self.last = sentence
         # The same fault with other numbers is the same cause.
         cause = f"{what}: {_NUMBER.sub('#', str(error))}"
         if cause in self._said or len(self._said) > _MOST_REASONS:
@@ -155,7 +155,7 @@ class Refusals:
         self._said.add(cause)
         last = "" if len(self._said) <= _MOST_REASONS else "; further reasons are not logged"
         self._node.get_logger().error(
-            f"{told} (others refused for the same reason are not logged){last}"
+            f"{sentence} (others refused for the same reason are not logged){last}"
         )
 
 
@@ -292,11 +292,11 @@ class OwnResults(ResultCheck):
         :param on_setpoint: True if the relay moves a set-point, so that its levels and its sign
             are not those of the command.
         """
-        told = message.experiment_id
+        experiment_id = message.experiment_id
         if running is not None:
             why = self._why_not_running(name, message, running, on_setpoint)
             if why is not None:
-                self.refusals.say("the model" if name == MODEL else "gains", told, why)
+                self.refusals.say("the model" if name == MODEL else "gains", experiment_id, why)
                 return []
         if name == MODEL:
             if self.model(message) is None:
@@ -306,7 +306,7 @@ class OwnResults(ResultCheck):
                 self._early = None
                 found += self.take(early[0], early[1], running, on_setpoint)
             return found
-        if message.final and told in self._evidence and told not in self.models:
+        if message.final and experiment_id in self._evidence and experiment_id not in self.models:
             self._early = name, message
             return []
         return [(name, message)] if self.gains(message) is not None else []

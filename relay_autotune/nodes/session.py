@@ -315,14 +315,14 @@ class SetpointSession(Session):
     def __init__(self, *args: Any, actual: Callable[[], float], **options: Any) -> None:
         super().__init__(*args, **options)
         self._actual = actual
-        self._told: list[float] = []
+        self._commands: list[float] = []
         self._last_sample: Sample | None = None
 
     def _hand_on(self, sample: Sample | None) -> None:
         if self._last_sample is not None:
-            told = self._actual()
-            self._told.append(told)
-            super()._hand_on((*self._last_sample[:4], told))
+            command = self._actual()
+            self._commands.append(command)
+            super()._hand_on((*self._last_sample[:4], command))
         self._last_sample = sample
 
     def record(self) -> Record:
@@ -336,19 +336,20 @@ class SetpointSession(Session):
         if self.experiment.finished:
             self._hand_on(None)
         record = super().record()
-        told = np.array(self._told[: len(record)])
-        if told.size < len(record):
-            told = np.append(told, np.full(len(record) - told.size, self._actual()))
+        commands = np.array(self._commands[: len(record)])
+        if commands.size < len(record):
+            commands = np.append(commands, np.full(len(record) - commands.size, self._actual()))
         settings = record.settings
         if settings is not None:
-            settings = _settings_of(settings, told, record)
-        return replace(record, command=told, settings=settings)
+            settings = _settings_of(settings, commands, record)
+        return replace(record, command=commands, settings=settings)
 
 
-def _settings_of(settings: RelaySettings, told: FloatArray, record: Record) -> RelaySettings:
+def _settings_of(settings: RelaySettings, commands: FloatArray, record: Record) -> RelaySettings:
     moved = np.flatnonzero(record.command != record.command[0])
-    rest = float(told[: moved[0]].mean()) if moved.size and moved[0] > 0 else float(told[0])
-    low, high = float(told.min()), float(told.max())
+    before = commands[: max(moved[0], 1)] if moved.size else commands[:1]
+    rest = float(before.mean())
+    low, high = float(commands.min()), float(commands.max())
     return replace(
         settings,
         baseline=rest,

@@ -396,10 +396,10 @@ class FollowWatch:
     def rail(self) -> dict[str, float]:
         """The ends of an actuator that moves but always stops short of the command [u]."""
         ends = {**self._ends, self._command: self._position}
-        told = sorted(command for command in ends if not math.isnan(command))
-        if len(told) < 2:
+        commands = sorted(command for command in ends if not math.isnan(command))
+        if len(commands) < 2:
             return {}
-        low, high = told[0], told[-1]
+        low, high = commands[0], commands[-1]
         moved = ends[high] - ends[low]
         if not 0.0 < moved < high - low - self._tolerance():
             return {}
