@@ -134,11 +134,6 @@ class Facts:
     """Sign of the process gain, 1 or -1 as given or found; 0 while unknown."""
     side: int = 0
     """Side of the rest on which the response began, 1 or -1; 0 before."""
-    dead_time_seen: float = math.nan
-    """Time from the kick to the last sample before the response [s]; NaN until it is seen.
-
-    Without noise the dead time lies between this and one sample interval more. With noise this
-    time is longer: the response must first leave the noise band."""
     response_time: float = math.nan
     """Time from the kick to the first sample of the response [s]; NaN until it is seen."""
 
@@ -382,7 +377,6 @@ class Kick:
             facts = replace(
                 self._facts,
                 side=detector.side,
-                dead_time_seen=detector.last_inside - self._begun,
                 response_time=detector.first_outside - self._begun,
             )
             return Left(Event.RESPONSE if facts.sign else Event.UNSIGNED_RESPONSE, facts)

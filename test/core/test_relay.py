@@ -93,7 +93,7 @@ def test_periods_converge_to_the_closed_forms_with_the_sample_period(gain):
 def test_the_dead_time_is_seen_to_a_sample():
     tune = experiment()
     run(tune, FopdtPlant(2.0, 5.0, 0.735), 0.01)
-    assert 0.0 <= 0.735 - tune.facts.dead_time_seen < 0.01
+    assert 0.0 < tune.facts.response_time - 0.735 <= 0.01
 
 
 def test_the_command_takes_the_levels_of_the_relay_only():
