@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from relay_autotune.bag.arrays import FloatArray, IntArray
 from relay_autotune.bag.signals import TIME_UNITS, Selection, Signal, flags_of
@@ -150,20 +149,21 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
     """
     with _table(path) as table:
         time, pair, said = _choose(path, table.names, wanted)
-        times, (y, u) = table.columns(time, pair)
-    lines = table.lines
+        times, columns = table.columns(time, pair)
+    values, lines = np.array(columns), table.lines
     notes = [*table.notes, *said]
     names = [table.names[at] for at in pair]
     if wanted.measurement is None and wanted.command is None:
-        why = _swap(path, names, y, u)
+        why = _swap(path, names, *values)
         if why:
-            names, y, u = names[::-1], u, y
+            names, values = names[::-1], values[::-1]
             notes.append(
                 f"{names[1]!r} is taken as the command and {names[0]!r} as the measurement, "
                 f"{why}; --measurement and --command name others"
             )
     if wanted.period is not None:
-        time_ns, dated = np.round(np.arange(y.size) * wanted.period * 1e9).astype(np.int64), False
+        counted = np.arange(values.shape[1])
+        time_ns, dated = np.round(counted * wanted.period * 1e9).astype(np.int64), False
     else:
         assert time is not None
         name = table.names[time]
@@ -173,7 +173,13 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
         time_ns, dated = _nanoseconds(path, name, times, unit, notes)
         if wanted.time is None and not is_time(name):
             _check_rises(path, name, time_ns)
-        y, u, time_ns, lines = _without_1970(name, dated, (y, u, time_ns, lines), notes)
+        unset = time_ns < EPOCH * 1e9
+        if dated and 0 < np.count_nonzero(unset) <= _UNSET * unset.size:
+            notes.append(
+                f"rows whose {name!r} is before 1973 are left out, since their clock was not set: "
+                f"{np.count_nonzero(unset)}, the first in line {lines[unset][0]}"
+            )
+            values, time_ns, lines = values[:, ~unset], time_ns[~unset], lines[~unset]
     units = {
         n: table.units.get(name) or unit_in(name) for n, name in zip("yu", names, strict=True)
     }
@@ -187,7 +193,7 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
     logs = []
     for first, last in pairwise(bounds):
         part = slice(first, last)
-        log = _log(names, time_ns[part], (y[part], u[part]), dated, notes)
+        log = _log(names, time_ns[part], values[:, part], dated, notes)
         logs.append(replace(log, units=units))
         notes = []
     return tuple(logs)
@@ -196,23 +202,24 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
 def _log(
     names: Sequence[str],
     time_ns: IntArray,
-    values: tuple[FloatArray, FloatArray],
+    values: FloatArray,
     dated: bool,
     notes: list[str],
 ) -> Log:
-    """Return one recording, its rows in the order of their time."""
+    """Return one recording, its rows in the order of their time.
+
+    :param values: of both columns, shape (2, n).
+    """
     back = int(np.count_nonzero(np.diff(time_ns) < 0))
     if back:
         notes.append(f"the time goes back at {back} rows; rows are put into its order")
     order = np.argsort(time_ns, kind="stable")
-    time_ns = time_ns[order]
-    values = values[0][order], values[1][order]
+    time_ns, values = time_ns[order], values[:, order]
     again = np.append(False, np.diff(time_ns) == 0)
-    twice = again & np.append(False, np.all([_same(v[1:], v[:-1]) for v in values], axis=0))
-    if np.any(twice) and np.array_equal(twice, again):
-        notes.append(f"{np.count_nonzero(twice)} rows stand twice, and count once")
-        time_ns, values = time_ns[~twice], (values[0][~twice], values[1][~twice])
-        again = again[~twice]
+    now, before = values[:, 1:][:, again[1:]], values[:, :-1][:, again[1:]]
+    if now.size and np.array_equal(now, before, equal_nan=True):
+        notes.append(f"{now.shape[1]} rows stand twice, and count once")
+        time_ns, values, again = time_ns[~again], values[:, ~again], again[~again]
     same = int(np.count_nonzero(again))
     if 2 * same > time_ns.size:
         time_ns, rows = _spread(time_ns)
@@ -236,10 +243,6 @@ def _log(
             )
         signals.append(Signal(name, time_ns[there], ordered[there]))
     return Log(signals[0], signals[1], dated, {}, tuple(notes))
-
-
-def _same(values: FloatArray, others: FloatArray) -> NDArray[np.bool_]:
-    return (values == others) | (np.isnan(values) & np.isnan(others))
 
 
 def _spread(time_ns: IntArray) -> tuple[IntArray, float]:
@@ -337,28 +340,6 @@ def _summer_time(name: str, time_ns: IntArray, notes: list[str]) -> IntArray:
         "summer time, and is counted on"
     )
     return time_ns + np.append(0, _HOUR * np.cumsum(back))
-
-
-def _without_1970(
-    name: str,
-    dated: bool,
-    rows: tuple[FloatArray, FloatArray, IntArray, IntArray],
-    notes: list[str],
-) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
-    """Return rows of columns without those few that a clock which was not set yet has stamped.
-
-    :param rows: two columns, the times [ns] and the lines.
-    """
-    unset = rows[2] < EPOCH * 1e9
-    count = int(np.count_nonzero(unset))
-    if not dated or not 0 < count <= _UNSET * unset.size:
-        return rows
-    notes.append(
-        f"rows whose {name!r} is before 1973 are left out, since their clock was not set: "
-        f"{count}, the first in line {rows[3][unset][0]}"
-    )
-    y, u, time_ns, lines = rows
-    return y[~unset], u[~unset], time_ns[~unset], lines[~unset]
 
 
 def _is_serial(time: FloatArray, longest: float) -> bool:
