@@ -130,7 +130,7 @@ def _for_fast(found: Identification, names: Sequence[str], tests: _Tests) -> lis
         half = half if math.isfinite(half) else 2.0 * fast
         said.append(
             f"a few steps to and fro in the same record, each held for about {digits(half, 2)} s, "
-            f"would tell the {text} apart, since fast changes show them"
+            f"would tell the {text} apart: it takes fast changes"
         )
     else:
         said.append(
