@@ -136,10 +136,15 @@ _INTEGRATING = Row(
 )
 
 
-def _lags(order: int, dead_time: float) -> Row:
-    """K/(tau s + 1)^n with the dead time that is known, or that the category assumes."""
+def equal_lags_row(order: int, dead_time: float = math.nan, ratio: float = math.nan) -> Row:
+    """Return the row of K/(tau s + 1)^n with a dead time.
+
+    :param order: n.
+    :param dead_time: where it is known [s].
+    :param ratio: else D/tau; default: what the category assumes.
+    """
     known, two = not math.isnan(dead_time), order == 2
-    assumed = SMALL_DEAD_TIME if two else 0.0
+    assumed = ratio if not math.isnan(ratio) else SMALL_DEAD_TIME if two else 0.0
 
     def solve(s: Shape, level: float | None) -> tuple[float, float, float]:
         wave = FIRST if level is None else EXACT
@@ -218,9 +223,9 @@ def _chosen(shape: Shape, reading: Reading, known: Known, categorised: str = "")
     if structure is not None:
         one_lag = FLAT_FOPDT if category == "1b" else SHARP_FOPDT
         rows = {FOPDT: one_lag, UNSTABLE_FOPDT: _UNSTABLE_FOPDT}
-        return replace(rows.get(structure) or _lags(structure.order, dead_time), text="")
+        return replace(rows.get(structure) or equal_lags_row(structure.order, dead_time), text="")
     if category in ("2", "3"):
-        return _lags(order, dead_time)
+        return equal_lags_row(order, dead_time)
     if category == "1b":
         return FLAT_FOPDT
     peak = shape.time_to_peak if math.isnan(dead_time) else dead_time

@@ -17,14 +17,13 @@ from dataclasses import replace
 from scipy.optimize import brentq
 
 from relay_autotune.errors import RelayAutotuneError, TuningError
-from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.limit_cycle.shape import Shape, shape_of_half_cycle
-from relay_autotune.identification.methods.lags import equal
 from relay_autotune.identification.methods.thyagarajan import (
     FLAT_FOPDT,
     HIGHER_ORDER,
     SHARP_FOPDT,
     dead_time_ratio,
+    equal_lags_row,
 )
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
@@ -181,20 +180,19 @@ def _equivalent(
     category: str, shape: Shape, model: TransferFunction
 ) -> tuple[TransferFunction | None, Callable[[DesignTask], _Designed]]:
     """Return a model of the category, None where the task has one, and the category's rule."""
-    if category in ("1a", "1b"):
-        row = SHARP_FOPDT if category == "1a" else FLAT_FOPDT
-        return row.structure.build(tuple(row.solve(shape, 0.0))), _table_4
-    lags, cycle = _real_lags(model), SymmetricCycle(shape.period, shape.amplitude, 1.0, 0.0, 0.0)
-    if category == "2":
-        if len(lags) == 2:
-            return None, phase_margin
-        ratio = dead_time_ratio(shape.growth)
-        k, tau = equal(2, cycle, ratio=ratio)
-        return TransferFunction.lag_n(k, tau, 2, ratio * tau), phase_margin
-    if len(lags) >= _LEAST_LAGS and max(lags) <= min(lags) * (1.0 + _EQUAL):
+    lags = _real_lags(model)
+    if category == "2" and len(lags) == 2:
+        return None, phase_margin
+    if category == "3" and len(lags) >= _LEAST_LAGS and max(lags) <= min(lags) * (1.0 + _EQUAL):
         return None, lcmax
-    k, tau = equal(HIGHER_ORDER, cycle)
-    return TransferFunction.lag_n(k, tau, HIGHER_ORDER, 0.0), lcmax
+    rows = {
+        "1a": (SHARP_FOPDT, _table_4),
+        "1b": (FLAT_FOPDT, _table_4),
+        "2": (equal_lags_row(2, ratio=dead_time_ratio(shape.growth)), phase_margin),
+        "3": (equal_lags_row(HIGHER_ORDER), lcmax),
+    }
+    row, rule = rows[category]
+    return row.structure.build(tuple(row.solve(shape, 0.0))), rule
 
 
 def _real_lags(model: TransferFunction) -> tuple[float, ...]:
