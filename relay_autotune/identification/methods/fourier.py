@@ -261,16 +261,15 @@ def _fit(structure: Structure, known: Known, sign: int, points: _Points) -> Fit:
 def _nearest(fit: Fit, points: _Points) -> tuple[float, FloatArray]:
     """Return the least sum of squares and where it is."""
     target = complex(points.value[points.frequency > 0.0][0])
-    names = fit.structure.names
     starts = []
     for lag in _LAGS if fit.structure.factors else _LAGS[:1]:
         start = {"gain": float(fit.sign), "time_constant": lag * fit.unit, "dead_time": 0.0}
-        trial = fit.structure.build(np.array([start[n] for n in names]))
-        ratio = target / complex(trial(1j / fit.unit))
+        values = np.array([start[name] for name in fit.structure.names])
+        ratio = target / complex(fit.structure.build(values)(1j / fit.unit))
         # The rest of the phase is dead time.
-        start["gain"] = abs(ratio)
-        start["dead_time"] = (-float(np.angle(ratio)) % (2.0 * math.pi)) * fit.unit
-        starts.append(np.array([start[n] for n in names]))
+        values[0] = abs(ratio)
+        values[-1] = (-float(np.angle(ratio)) % (2.0 * math.pi)) * fit.unit
+        starts.append(values)
     cost, x = fit.best(starts)
     # Another period of dead time turns each harmonic by whole turns, and fits as well.
     values = fit.values(x)

@@ -314,10 +314,11 @@ def equal(
         return wave.level(lags, period, part(tau)) - at_switch
 
     longest = min(_LONGEST * period, 0.5 * period * cycle.part / ratio if ratio else math.inf)
-    tau, found = 0.5 * period * cycle.part / (3.0 * order + 60.0), math.nan
+    tau = 0.5 * period * cycle.part / (3.0 * order + 60.0)
+    height = excess(tau)
     while tau * _STEP < longest:
-        before, tau, was, found = tau, tau * _STEP, found, excess(tau * _STEP)
-        if found <= 0.0 and (excess(before) if math.isnan(was) else was) > 0.0:
+        before, tau, was, height = tau, tau * _STEP, height, excess(tau * _STEP)
+        if height <= 0.0 < was:
             fits = root(excess, before, tau)
             if wave.slope_sign((fits,) * order, period, part(fits)) > 0.0:
                 relative = wave.peak((fits,) * order, period)
