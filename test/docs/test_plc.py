@@ -37,11 +37,12 @@ def by_relay() -> PiecewiseConstant:
     for second in range(101, 600):
         u = PiecewiseConstant(np.array(at), np.array(to), 45.0)
         before, now = response(OVEN, np.array([0.0, second - 1.0, second]), u)[1:]
-        if (before < 0.0 <= now) if to[-1] > 45.0 else (before > 0.0 >= now):
+        if (before <= 0.0 < now) if to[-1] > 45.0 else (before >= 0.0 > now):
             at.append(second + 0.5)
             to.append(45.0 if len(at) > 8 else 33.0 if to[-1] > 45.0 else 61.0)
         if len(at) > 8:
             break
+    assert len(at) == 9
     return PiecewiseConstant(np.array(at), np.array(to), 45.0)
 
 
