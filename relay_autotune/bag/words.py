@@ -49,6 +49,8 @@ _BARE = re.compile(
     r"mV|[kM]?Hz|[kM]W|mA|l/min|l/h|m3/h|m³/h|kg/h|t/h)\s*$"
 )
 _PERCENT = ("pct", "percent", "prozent")
+# Units of temperatures, pressures and speeds, which no actuator is told in.
+_OF_SENSORS = re.compile(r"(deg ?|°)[CFK]|[kMm]?Pa|m?bar|psi|rpm")
 
 
 def words_of(name: str) -> frozenset[str]:
@@ -64,6 +66,8 @@ def role_of(name: str) -> str | None:
 
     >>> role_of("TIC201.PV (degC)"), role_of("Sollwert"), role_of("pump speed")
     ('measurement', 'set-point', None)
+    >>> role_of("Heater (%)"), role_of("Zone 2 (°C)"), role_of("Heater (°C)"), role_of("Motor rpm")
+    ('command', 'measurement', None, 'measurement')
     """
     words = words_of(name)
     if {"set", "point"} <= words:
@@ -71,8 +75,8 @@ def role_of(name: str) -> str | None:
     said = _said(words, _ROLES)
     if said:
         return said[0]
-    parts = _said(words, _PARTS)
-    return parts[0] if len(parts) == 1 else None
+    parts = {*_said(words, _PARTS), *[MEASUREMENT] * bool(_OF_SENSORS.fullmatch(unit_in(name)))}
+    return parts.pop() if len(parts) == 1 else None
 
 
 def _said(words: frozenset[str], table: Mapping[str, str]) -> list[str]:

@@ -5,11 +5,13 @@
 
 from __future__ import annotations
 
+import doctest
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
 
+from relay_autotune.bag import words
 from relay_autotune.bag.csv_file import read_csv
 from relay_autotune.bag.signals import Selection
 from relay_autotune.errors import BagError, SelectionError
@@ -70,6 +72,9 @@ NAMED = [
     (("Time", "PIC7_SP_bar", "PIC7_PV_bar", "PIC7_CV_pct"), {"y": "bar", "u": "%"}),
     (("Time (min)", "Level SP (%)", "Level PV (%)", "Out (%)"), {"y": "%", "u": "%"}),
     (("Elapsed ms", "Target", "T3 degC", "Heater %"), {"y": "degC", "u": "%"}),
+    # What is told in a unit of temperature or speed is measured, whatever it is of.
+    (("Time", "Ref", "Heater (°C)", "Heater (%)"), {"y": "°C", "u": "%"}),
+    (("Time", "Ref", "Motor rpm", "PWM"), {"y": "rpm"}),
 ]
 
 
@@ -85,6 +90,10 @@ def test_the_one_pair_that_names_allow_is_taken_and_said(tmp_path, names, units,
     assert record.units == units
     _, _, y, u = names
     assert any(f"{y!r} is taken as the measurement and {u!r} as the" in n for n in found.notes)
+
+
+def test_the_examples_of_names_are_true():
+    assert doctest.testmod(words).failed == 0
 
 
 def test_one_column_that_is_left_is_the_command_only_if_no_other_is(tmp_path):
