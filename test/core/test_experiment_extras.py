@@ -23,6 +23,7 @@ from relay_autotune.experiment.faults import (
     is_growing,
 )
 from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.identification.known import Known
 from relay_autotune.process.structures import UNSTABLE_FOPDT, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
@@ -148,7 +149,8 @@ def test_a_given_amplitude_beyond_the_ends_of_the_actuator_never_completes(
 @pytest.mark.by_day(2)
 @pytest.mark.parametrize("share", [0.1, 0.6, 0.2, 0.4])
 @pytest.mark.parametrize("std", [0.002, 0.02])
-def test_both_levels_clipped_alike_within_the_limits_are_not_trusted(share, std):
+@pytest.mark.parametrize("known", [Known(structure="fopdt"), Known()], ids=["fopdt", "chosen"])
+def test_both_levels_clipped_alike_within_the_limits_are_not_trusted(known, share, std):
     """True Ms of its gains: 1.9 at six tenths of the amplitude, unstable at two tenths."""
     limits = {"command_min": -5.0, "command_max": 5.0}
     tune = RelayExperiment(ExperimentParameters(amplitude=1.0, **limits), 0.0, from_small=True)
@@ -159,7 +161,7 @@ def test_both_levels_clipped_alike_within_the_limits_are_not_trusted(share, std)
         if tune.finished:
             break
     if tune.outcome is Outcome.COMPLETED:
-        assert analyse(tune.record(), alone=True).verdict is not Verdict.TRUSTED
+        assert analyse(tune.record(), known=known, alone=True).verdict is not Verdict.TRUSTED
 
 
 def test_a_first_amplitude_that_cannot_leave_the_band_is_made_larger_soon():

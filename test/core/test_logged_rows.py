@@ -41,12 +41,12 @@ def _true_ms(gains) -> float:
 )
 def test_a_faster_controller_gets_gains_that_hold_whenever_the_command_changed(interval, instants):
     asked = DesignOptions(sample_period=1.0)
-    found = analyse(_logged(interval, instants), rule="robust", options=asked)
+    found = analyse(_logged(interval, instants), rule="robust", options=asked, alone=True)
     assert _true_ms(found.best_gains) < 1.5
     assert any("before its row" in warning for warning in found.model.warnings)
 
 
 def test_the_controller_that_wrote_the_table_is_told_nothing_of_it():
-    found = analyse(_logged(30.0, (600.0, 2220.0, 3900.0)), rule="robust")
+    found = analyse(_logged(30.0, (600.0, 2220.0, 3900.0)), rule="robust", alone=True)
     assert not any("before its row" in warning for warning in found.model.warnings)
     assert _true_ms(found.best_gains) < 1.5

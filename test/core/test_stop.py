@@ -31,7 +31,8 @@ def told_of_a_stop(found):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("noise", [0.002, 0.01, 0.02])
+@pytest.mark.by_day(2)
+@pytest.mark.parametrize("noise", [0.002, 0.02, 0.01])
 def test_a_stop_is_no_rest(noise):
     # Gains of a process that would come to rest at the stop made this one grow.
     found = analyse(recorded(AXIS, [3.0], [1.0], end=30.0, noise=noise), alone=True)

@@ -11,9 +11,10 @@ from types import SimpleNamespace
 import pytest
 from analysed import completed, swing_check
 
-from relay_autotune.analysis import model_so_far
+from relay_autotune.analysis import Task, model_so_far
 from relay_autotune.errors import ParameterError
 from relay_autotune.identification.judgement.table import CHECKS, MODEL_CHECKS
+from relay_autotune.identification.known import Known
 from relay_autotune.identification.result import Validation
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Result, Verdict, judge, verdict_named
 
@@ -71,7 +72,8 @@ def test_rows_have_names_of_their_own_and_a_limit():
 
 @pytest.mark.long
 def test_a_running_experiment_is_not_judged():
-    assert model_so_far(completed().record).verdict is Verdict.UNKNOWN
+    task = Task(known=Known(structure="fopdt"))
+    assert model_so_far(completed().record, task).verdict is Verdict.UNKNOWN
 
 
 def test_a_model_without_limit_cycle_is_said_in_words_and_a_start_away_from_rest_comes_first():
