@@ -50,7 +50,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace) -> int:
-    file = options.params or _installed("tutorial.yaml")
+    file = options.params or installed("tutorial.yaml")
     if not file.is_file():
         # ROS itself would only warn, and start the nodes with their defaults.
         raise SelectionError(f"--params {file}: there is no such file")
@@ -62,7 +62,7 @@ def _run(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _installed(name: str) -> Path:
+def installed(name: str) -> Path:
     """Return a file of the package's folder config, as it is installed."""
     from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 
