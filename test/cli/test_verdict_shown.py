@@ -18,6 +18,7 @@ from relay_autotune.cli.jobs import status_of
 from relay_autotune.cli.table import table
 from relay_autotune.exchange.messages import fill_gains
 from relay_autotune.exchange.models import document
+from relay_autotune.identification.known import Known
 from relay_autotune.identification.result import Rival
 from relay_autotune.report.case import case_of, cases_of_document
 from relay_autotune.report.findings import checks_of, verdict_of
@@ -91,13 +92,18 @@ def test_it_is_said_why_a_rival_of_more_support_is_not_taken(monkeypatch):
 
 def test_the_period_of_the_controller_is_said_with_the_gains():
     record = completed().record
-    own = analyse(record).best_gains.reason
+    own = completed().best_gains.reason
     period = f"{record.interval:.3g}"
     assert own.endswith(
         f"; for a controller that runs every {period} s, the interval of the recording; "
         "--sample-period names another"
     )
-    given = analyse(record, options=DesignOptions(sample_period=0.5 * record.interval))
+    given = analyse(
+        record,
+        known=Known(structure="fopdt"),
+        options=DesignOptions(sample_period=0.5 * record.interval),
+        alone=True,
+    )
     told = given.best_gains.reason
     assert told.endswith(f"; for a controller that runs every {0.5 * record.interval:g} s")
 

@@ -58,7 +58,7 @@ def test_gains_and_verdict_are_those_of_an_analysis_with_the_same_options(
     analysis, subject, asked
 ):
     options = asked.options(DesignOptions())
-    expected = analyse(analysis.record, rule=asked.rule, options=options)
+    expected = analyse(analysis.record, rule=asked.rule, options=options, alone=True)
     found = subject.shaped(asked)
     assert found.gains == expected.best_gains
     assert found.judgement == expected.judgement
