@@ -12,13 +12,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.residuals import Colour
 from relay_autotune.identification.waveform.separable import (
     NEGLIGIBLE,
@@ -67,6 +66,8 @@ _SAMPLES_EACH = 8
 _MANY = 6
 # What may be estimated beside the model, as fields of a problem.
 TERMS = ("drift", "relaxation", "past", "unequal", "load", "friction")
+# Those of what went on before the record, for which a dead time can stand.
+_BEFORE = frozenset(("drift", "relaxation", "past"))
 # Steps of a fit with a further term or in another colour; instants at which a load is tried, and
 # steps to the best.
 STEPS, _INSTANTS, _STEPS_IN_TIME = 15, 60, 4
@@ -147,6 +148,7 @@ class FitContext:
     fopdt: Trial
     sign: int
     held: bool
+    _fopdts: dict[tuple[float | None, ...], Trial] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, problem: Problem, sign: int, *, held: bool) -> FitContext:
@@ -275,25 +277,42 @@ class FitContext:
                 changed: dict[str, Any] = dict.fromkeys(terms, True)
                 problem = replace(candidate.problem, **changed)
                 state = refine(problem, candidate.state.theta, tolerance=TRIAL, most=STEPS)
-                anew = self._anew(problem, terms)
-                if anew:
-                    state = min(state, best_of(problem, anew), key=lambda s: s.cost)
+                if not _BEFORE.isdisjoint(terms):
+                    state = self._out_of_a_wrong_minimum(problem, state)
             other = self.candidate(problem, state)
             if other is not None:
                 found.append(other)
         return found
 
-    def _anew(self, problem: Problem, terms: tuple[str, ...]) -> list[FloatArray]:
-        """Return other starts with a further term: without it, a dead time may have stood for it.
+    def _out_of_a_wrong_minimum(self, problem: Problem, state: Trial) -> Trial:
+        """Return a fit with a further term, begun anew where a FOPDT explains more.
 
-        :param problem: with the term.
-        :param terms: what was added.
+        Without the term, a dead time or a lag may have stood for it.
+
+        :param problem: what was fitted.
+        :param state: its fit, from that without the term.
         """
-        if problem.structure == FOPDT and "past" in terms:
-            return start_fopdt(problem, self.sign)
-        if problem.structure == IPDT and "drift" in terms:
-            return [np.array((problem.shortest,))]
-        return []
+        beside = replace(problem, structure=FOPDT)
+        fopdt = self._fopdt_of(beside)
+        if fopdt.cost >= state.cost:
+            return state
+        if problem.structure == FOPDT:
+            return fopdt
+        starts = Guess.of(beside, fopdt).starts(problem.structure)
+        return min(state, best_of(problem, starts), key=lambda s: s.cost)
+
+    def _fopdt_of(self, problem: Problem) -> Trial:
+        """Return the best fit of a FOPDT with some terms, found once for each set of them.
+
+        :param problem: of this context's samples, with a FOPDT structure.
+        """
+        key = (*nuisances_of(problem), problem.load)
+        if not any(nuisances_of(problem)):
+            return self.fopdt
+        if key not in self._fopdts:
+            starts = [self.fopdt.theta, *start_fopdt(problem, self.sign)]
+            self._fopdts[key] = best_of(problem, starts)
+        return self._fopdts[key]
 
     @cached_property
     def terms(self) -> list[tuple[str, ...]]:
@@ -318,13 +337,11 @@ class FitContext:
         :param candidate: fitted to the same samples.
         """
         problem = replace(candidate.problem, structure=FOPDT, colour=None)
-        fopdt = self.fopdt
+        fopdt = self._fopdt_of(problem)
         if any(nuisances_of(problem)):
-            starts = [self.fopdt.theta, *start_fopdt(problem, self.sign)]
-            fopdt = best_of(problem, starts)
             # A FOPDT has the longest dead time of all, since it includes every small lag.
             problem = drop_first_dead_time(problem, fopdt)
-        return replace(self, problem=problem, fopdt=fopdt)
+        return replace(self, problem=problem, fopdt=fopdt, _fopdts={})
 
     def fit(
         self, names: Iterable[str], order: int = 0, ready: Sequence[Candidate] = ()

@@ -108,7 +108,6 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
     )
     problem = replace(
         problem,
-        averaged=any(r.unthinned is not None for r in records),
         motions=motions_of(problem.time, problem.y, inputs[0]) if len(records) == 1 else (),
     )
     samples, problem = problem.time.size, problem.thinned(_MOST_SAMPLES)

@@ -78,7 +78,6 @@ class Problem:
     :param motions: the direction in which the measurement moves, 1 or -1, and the command from
         its first level while it stands still; empty: not seen.
     :param colour: of the noise; None: white.
-    :param averaged: True: each sample is the mean of several.
     """
 
     time: FloatArray
@@ -96,7 +95,6 @@ class Problem:
     friction: bool = False
     motions: tuple[PiecewiseConstant, ...] = ()
     colour: Colour | None = None
-    averaged: bool = False
 
     @property
     def past_is_open(self) -> bool:
@@ -217,8 +215,8 @@ class Problem:
         self, theta: FloatArray, part: slice, number: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return one experiment's columns with their derivatives, and its straight line."""
-        time, u = self.time[part], self.inputs[number]
-        blocks = [columns_of(self.structure, theta, time, u)]
+        time = self.time[part]
+        blocks = [columns_of(self.structure, theta, time, self.inputs[number])]
         if self.relaxation or self.structure.unstable:
             growing_only = not self.relaxation
             blocks.append(
@@ -226,22 +224,38 @@ class Problem:
             )
         if self.friction:
             blocks += [self._at_once(theta, time, seen) for seen in self.motions]
-        further = []
-        if self.past:
-            # The level before is that of a step at the first sample, with the same response.
-            further.append(pulse(float(time[0])))
-        if self.unequal:
-            further.append(_folded(u))
-        if self.load is not None:
-            further += [pulse(self.load, length) for length in (math.inf, self.shortest)]
-        blocks += [columns_of(self.structure, theta, time, step) for step in further]
-        rest = np.ones((1 + self.drift, time.size))
-        if self.drift:
-            rest[1] = (time - time.mean()) / np.ptp(time)
+        further = self.further_inputs(number)
+        blocks += [columns_of(self.structure, theta, time, u) for u in further]
+        rest = self.line(time)
         if len(blocks) == 1:
             return *blocks[0], rest
         columns = np.concatenate([b[0] for b in blocks])
         return columns, np.concatenate([b[1] for b in blocks], axis=1), rest
+
+    def further_inputs(self, number: int) -> list[PiecewiseConstant]:
+        """Return the inputs beside the command whose responses have the model's dead time.
+
+        :param number: of the experiment.
+        """
+        found = []
+        if self.past:
+            # The level before is that of a step at the first sample, with the same response.
+            found.append(pulse(float(self.time[self.experiments[number]][0])))
+        if self.unequal:
+            found.append(_folded(self.inputs[number]))
+        if self.load is not None:
+            found += [pulse(self.load, length) for length in (math.inf, self.shortest)]
+        return found
+
+    def line(self, time: FloatArray) -> FloatArray:
+        """Return the offset and, where estimated, the drift of one experiment, shape (1 or 2, n).
+
+        :param time: of its samples [s], shape (n,).
+        """
+        rows = np.ones((1 + self.drift, time.size))
+        if self.drift:
+            rows[1] = (time - time.mean()) / np.ptp(time)
+        return rows
 
     def _at_once(
         self, theta: FloatArray, time: FloatArray, u: PiecewiseConstant

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.identification.waveform.rational import columns_of, unit_steps
+from relay_autotune.identification.waveform.rational import columns_of, free_motion, unit_steps
 from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Problem,
@@ -295,37 +295,38 @@ def _apart(a: FloatArray, b: FloatArray) -> bool:
 def _costs(
     problem: Problem, tau: float, dead_times: FloatArray, latest: tuple[float, float]
 ) -> FloatArray:
-    """Return the sums of squares that a lag and an offset leave, for each dead time.
+    """Return the sums of squares that a lag and the terms beside it leave, for each dead time.
 
     Half a period later, a limit cycle of the other sign looks much the same: a lag of the wrong
     sign counts as no explanation, as does one that begins after the first response.
     """
     theta = np.array((math.log(tau), 0.0))
     along, power, total = (np.zeros(dead_times.size) for _ in range(3))
-    for part, u in zip(problem.experiments, problem.inputs, strict=True):
-        # A dead time only shifts the response: one pass over shifted samples gives all rows.
-        moved = problem.time[part] - dead_times[:, None]
-        table = _table(problem.structure, theta, moved, u)
-        y = np.tile(problem.y[part] - problem.y[part].mean(), (dead_times.size, 1))
-        if problem.past:
-            before = _table(problem.structure, theta, moved, pulse(float(problem.time[part][0])))
-            own = np.einsum("dn,dn->d", before, before)
-            own[own == 0.0] = 1.0
-            before /= np.sqrt(own)[:, None]
-            table = table - np.einsum("dn,dn->d", table, before)[:, None] * before
-            y = y - np.einsum("dn,dn->d", y, before)[:, None] * before
-        power += np.einsum("dn,dn->d", table, table)
-        along += np.einsum("dn,dn->d", table, y)
-        total += np.einsum("dn,dn->d", y, y)
+    for number, (part, u) in enumerate(zip(problem.experiments, problem.inputs, strict=True)):
+        time, y = problem.time[part], problem.y[part]
+        # A dead time only shifts a response: one pass over shifted samples gives all rows.
+        moved = time - dead_times[:, None]
+        response, *shifted = (
+            shifted_columns(problem.structure, theta, moved, each)[0]
+            for each in (u, *problem.further_inputs(number))
+        )
+        fixed = problem.line(time)
+        if problem.relaxation:
+            free, _ = free_motion(problem.structure.denominator, theta, time)
+            fixed = np.concatenate((fixed, free))
+        terms = np.stack([*(np.broadcast_to(row, moved.shape) for row in fixed), *shifted], -1)
+        basis, _ = np.linalg.qr(terms / np.maximum(np.linalg.norm(terms, axis=1), 1e-300)[:, None])
+        for_each = np.broadcast_to(y, moved.shape)
+        left, response = (
+            rows - np.einsum("dnk,dk->dn", basis, np.einsum("dnk,dn->dk", basis, rows))
+            for rows in (for_each, response)
+        )
+        power += np.einsum("dn,dn->d", response, response)
+        along += np.einsum("dn,dn->d", response, left)
+        total += np.einsum("dn,dn->d", left, left)
     power[power == 0.0] = 1.0
     refused = dead_times > np.where(along < 0.0, *latest)
     return np.asarray(total - np.where(refused, 0.0, along**2 / power))
-
-
-def _table(structure: Structure, theta: FloatArray, moved: FloatArray, u: Input) -> FloatArray:
-    """Return a lag's responses at moved times about their means, one row for each dead time."""
-    table = shifted_columns(structure, theta, moved, u)[0]
-    return np.asarray(table - table.mean(axis=1, keepdims=True))
 
 
 def shifted_columns(
