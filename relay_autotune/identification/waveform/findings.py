@@ -42,7 +42,6 @@ from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Problem,
     Trial,
-    evaluate,
     left_of,
     refine,
 )
@@ -236,7 +235,7 @@ def _prediction(records: Sequence[Record], problem: Problem, state: Trial) -> fl
         # These terms depend on where the samples begin and end.
         return math.nan
     earlier = refine(before, state.theta, tolerance=TRIAL)
-    error = last.y - earlier.coefficients @ evaluate(last, earlier.theta).columns
+    error = raw_residual(last, earlier)
     return math.sqrt(float(np.mean(error**2)))
 
 
