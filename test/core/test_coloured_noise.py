@@ -16,10 +16,17 @@ from scipy.signal import lfilter
 from relay_autotune.analysis import analyse
 from relay_autotune.identification.known import NOTHING
 from relay_autotune.identification.waveform.candidates import FitContext, nuisances_of, support
-from relay_autotune.identification.waveform.choice import _compared, _simulates, chosen_fit
+from relay_autotune.identification.waveform.choice import (
+    _best_of_all,
+    _compared,
+    _Reached,
+    _simulates,
+    chosen_fit,
+)
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.residuals import colour_of, slow_colour
 from relay_autotune.identification.waveform.separable import evaluate, problem_of
+from relay_autotune.identification.waveform.starts import start_fopdt
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
@@ -274,9 +281,38 @@ def test_a_model_whose_response_the_colour_explains_does_not_simulate():
     bent = replace(
         right, state=evaluate(problem, right.state.theta + np.array((math.log(3.0), 0.0)))
     )
-    assert _simulates([right], [right])
-    assert not _simulates([bent], [right])
-    assert not _simulates([], [right])
+    least = right.state.cost / problem.time.size
+    assert _simulates(right, least)
+    assert not _simulates(bent, least)
+
+
+def test_a_colour_counts_where_it_simulates_as_well_as_other_terms_do():
+    """Beside a drift the best simulation is worse, and a worse model passed for as good."""
+    time = PERIOD * np.arange(600)
+    u = PiecewiseConstant(np.array([6.0, 30.0]), np.array([1.0, 0.3]), 0.0)
+    noise = 0.02 * np.random.default_rng(3).standard_normal(time.size)
+    problem = problem_of([(time, response(PROCESS, time, u) + noise, u)], FOPDT)
+    context = FitContext.of(problem, 1, held=False)
+    (right,) = context.fit(["fopdt"])
+    late = replace(right, state=evaluate(problem, right.state.theta + np.array((0.0, 3.0))))
+    likely = replace(late, score=right.score - 1e6)
+    beside = _Reached(simulated=[late], coloured=[[likely]])
+    assert _best_of_all([beside]) == [likely]
+    assert _best_of_all([_Reached([right], []), beside]) == [right]
+
+
+def test_starts_know_what_is_estimated_beside_the_model():
+    """A free initial state explains most: a dead time of the whole record stood for it."""
+    time = PERIOD * np.arange(900)
+    u = PiecewiseConstant(np.array([10.0, 25.0, 40.0, 65.0]), np.array([1.0, -0.5, 0.8, 0.0]), 0.0)
+    y = response(TransferFunction.fopdt(2.0, 12.0, 0.6), time, u) + 6.0 * np.exp(-time / 12.0)
+    problem = replace(problem_of([(time, y, u)], FOPDT), relaxation=True)
+    assert start_fopdt(problem)[0][1] < 2.0
+    assert start_fopdt(replace(problem, relaxation=False))[0][1] > 5.0
+    context = FitContext.of(replace(problem, relaxation=False), 0, held=False)
+    (simple,) = context.fit(["sopdt"])
+    free = next(c for c in context.with_one_more_term(simple) if c.problem.relaxation)
+    assert free.model.dead_time < 0.7
 
 
 @pytest.mark.parametrize("sign", [0, 1])
