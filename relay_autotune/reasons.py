@@ -422,9 +422,11 @@ class Code(enum.IntEnum):
     SIGNAL = _Row(202, "the node was stopped by {signal}")
     """Ctrl-C, a service manager, or SIGHUP: the terminal was closed or its connection lost.
     Start the node with nohup, in tmux or as a service."""
-    SILENT_SENSOR = _Row(203, "no measurement on {topic} for {silence:.3g} s")
-    """The sensor is dead or its cable loose, the machine is overloaded, or it publishes only on
-    change: give repeat_period then."""
+    SILENT_SENSOR = _Row(
+        203, "no measurement on {topic} for {silence:.3g} s", typed="measurement_timeout SECONDS"
+    )
+    """The sensor is dead or its cable loose, the machine is overloaded, the sensor is slower than
+    measurement_timeout, or it publishes only on change: give repeat_period then."""
     SENSOR_GONE = _Row(204, "no measurement on {topic} any more: its publisher has left")
     """The sensor's process has ended."""
     MISREAD = _Row(205, "the {what} on {topic} cannot be read: {why}")
@@ -498,7 +500,9 @@ class Code(enum.IntEnum):
     NO_MEASUREMENT_YET = _Row(301, "no measurement has come yet: {why}", transient=True)
     """A best-effort sensor, another type, another topic, or no sensor: the sentence says which;
     see measurement_type and measurement_field."""
-    NO_MEASUREMENT_NOW = _Row(316, "no measurement has come for {silence:.3g} s: {why}")
+    NO_MEASUREMENT_NOW = _Row(
+        316, "no measurement has come for {silence:.3g} s: {why}", transient=True
+    )
     """The sensor has fallen silent."""
     NO_CLOCK = _Row(302, "use_sim_time is true, but no time has come on /clock", transient=True)
     """The simulation does not run, or publishes no clock."""

@@ -340,9 +340,12 @@ class AfterTune:
             return [("once it rests", told)]
         steps = [*loop.first(), ("run it again", again)]
         if result.why.code == Code.SILENT_SENSOR:
-            topic = reason_from_message(result.why)["topic"]
-            told = f"the sensor (ros2 topic hz {topic}) and the load of the machine (uptime)"
-            steps.append(("if it happens again", f"look at {told}"))
+            why = reason_from_message(result.why)
+            told = (
+                f"the sensor (ros2 topic hz {why['topic']}) and the load of the machine (uptime)"
+            )
+            wait = f"for a longer silence {loop.to_type(why)}"
+            steps.append(("if it happens again", f"look at {told}; {wait}"))
         return steps
 
     # The report.

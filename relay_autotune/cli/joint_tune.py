@@ -277,6 +277,7 @@ class JointLoop(Loop):
         loop, options = self._loop, self.options
         topics, values = self._opened_ends() if options.open else self._closed_ends()
         values["amplitude"] = options.amplitude
+        values |= self.answers.parameters(["measurement_timeout"])
         nodes = {"relay_node": ros_arguments(self._space, topics, values)}
         if not options.record_only:
             design = {"law": loop.law, "sample_period": loop.period}

@@ -188,7 +188,9 @@ class TopicLoop(Loop):
         self._command_field = options.command_field or "data"
         try:
             with Working(f"listening to {measurement}"):
-                answers.measured = client.measured(measurement, self._kind, options.field)
+                answers.measured = client.measured(
+                    measurement, self._kind, options.field, options.wait
+                )
             self._commands = CommandMessage(
                 self._command_kind, self._command_field, options.command_message or ""
             )
@@ -275,6 +277,8 @@ class TopicLoop(Loop):
             "measurement_type": self._kind,
             "command_type": self._command_kind,
             "baseline_is_present": True,
+            # By the rate, which relay_node measures before the tune.
+            "measurement_timeout": 0.0,
             **self.answers.parameters(),
             "command_field": self._command_field,
             "amplitude": options.amplitude,

@@ -99,6 +99,9 @@ SETTINGS = (
     Setting("command_period", NOT_GIVEN, "s", parameters=("command_period",)).means(
         "send the last command again after this time, for an actuator that stops without"
     ),
+    Setting("measurement_timeout", NOT_GIVEN, "s", parameters=("measurement_timeout",)).means(
+        "longest silence of the measurement; default: five of its intervals, and at least 1 s"
+    ),
     Setting(
         "at", NOT_GIVEN, "u", question="present command, at which the process rests",
         # The safe command also where a controller_node in front of it has ended.
@@ -138,17 +141,17 @@ SETTINGS = (
     Setting("accept_doubtful", False).means("with --export: also gains that are doubtful"),
 )  # fmt: skip
 SETTING = {each.name: each for each in SETTINGS}
-_FLAGS = {name: flag_of(each) for each in SETTINGS for name in each.parameters}
+FLAGS = {name: flag_of(each) for each in SETTINGS for name in each.parameters}
 
 
 def flag_to_give(why: Reason) -> str:
     """Return what to give in place of a node's parameter that a reason names."""
-    return f"give {_FLAGS.get(why.parameter, why.parameter)}"
+    return f"give {FLAGS.get(why.parameter, why.parameter)}"
 
 
 def as_flags(text: str) -> str:
     """Return an error's text with the flags in place of the parameters of the same meaning."""
-    for parameter, flag in _FLAGS.items():
+    for parameter, flag in FLAGS.items():
         text = re.sub(rf"\b{parameter}\b", flag, text)
     return text
 

@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from relay_autotune.cli.arguments import (
@@ -33,7 +34,7 @@ from relay_autotune.cli.arguments import (
     say,
 )
 from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN, own_namespace
-from relay_autotune.cli.settings import Kind, add_joint, add_settings, kind_of
+from relay_autotune.cli.settings import FLAGS, Kind, add_joint, add_settings, kind_of
 from relay_autotune.cli.terminal import Help, Working, agrees, require_new, width
 from relay_autotune.cli.tune_view import TICK, Shown, check_lines, follow
 from relay_autotune.errors import ParameterError, SelectionError
@@ -58,6 +59,7 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(own)
     _require_consistent(parser, options)
+    _require_no_parameter(parser, options, ros)
     options.typed = given
     if (options.measurement and options.command) or options.joint:
         # At once, since what follows takes a second to load.
@@ -97,6 +99,21 @@ def _require_consistent(parser: argparse.ArgumentParser, options: argparse.Names
             "--verify proves the gains of a tune that prints them: leave out --web, --json, "
             "--record-only and --dry-run"
         )
+
+
+def _require_no_parameter(
+    parser: argparse.ArgumentParser, options: argparse.Namespace, ros: list[str]
+) -> None:
+    """End the program if a parameter is given that only relay_node has."""
+    for flag, given in pairwise(ros):
+        name, is_set, value = given.partition(":=")
+        if flag not in ("-p", "--param") or not is_set or name == "use_sim_time":
+            continue
+        node = "/".join(("", *filter(None, (options.namespace.strip("/"), options.node))))
+        do = f"type ros2 param set {node} {name} {value}"
+        if options.measurement or options.joint:
+            do = f"give {FLAGS[name]} {value}" if name in FLAGS else "leave it out"
+        parser.error(f"{flag} {given} sets nothing in relay_node: {do}")
 
 
 def _apart(given: list[str]) -> tuple[list[str], list[str]]:
@@ -212,7 +229,9 @@ class Session:
         self._find(loops, patience)
         for each in loops:
             each.hand_over()
-        deadline = time.monotonic() + min(patience, _READY_WITHIN)
+        # A sensor that is slower than that needs a longer --wait.
+        ready_within = max(self._options.wait, _READY_WITHIN)
+        deadline = time.monotonic() + min(patience, ready_within)
         loop = loops[0]
         print("".join(f"{line}\n" for line in check_lines(loop.plan(), width())), end="",
               file=sys.stderr, flush=True)  # fmt: skip

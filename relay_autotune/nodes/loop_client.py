@@ -445,19 +445,20 @@ class LoopClient:
             self.rest(_LISTEN)
         return sum(heard) / len(heard) if heard else math.nan
 
-    def measured(self, topic: str, type_name: str, field: str) -> float:
-        """Return the present measurement; NaN: none comes within a second.
+    def measured(self, topic: str, type_name: str, field: str, patience: float) -> float:
+        """Return the present measurement; NaN: none comes.
 
         :param topic: name of its topic.
         :param type_name: its message type.
         :param field: path of the number in its messages.
+        :param patience: how long to wait for it [s].
         :raises ParameterError: if the messages of this type do not have such a number.
         """
         reader = reader_of(type_name, field)
         heard: list[float] = []
         hear = readable(reader.value, heard.append)
         with self._hearing(reader.kind, self._resolved(topic), hear):
-            self.wait(lambda: bool(heard), _LISTEN)
+            self.wait(lambda: bool(heard), patience)
         return heard[-1] if heard else math.nan
 
     def _topic_of(self, relay: str, topic: str, type_name: str, *, published: bool) -> str:

@@ -384,7 +384,7 @@ class LoopSupervisor:
         """
         self._was_connected = self.is_connected
         self._experiment, self._gives_back = experiment, gives_back
-        self._overtime = watch.Overtime.of(experiment, self._node)
+        self._overtime = watch.Overtime.of(experiment, self._node, self._sensor)
         self._sensor.begin()
         self.commanded = math.nan
         if self._ends.setpoint is None:

@@ -219,8 +219,7 @@ class Readiness:
         parameters = ExperimentParameters(**chosen)
         planned = partial(self._planned, values, parameters, held, last)
         ready = checks.do("levels", planned, lambda found: found.plan)
-        measures = partial(self._require_measurement, values["measurement_timeout"])
-        checks.do("measurement", measures, lambda _: self._heard())
+        checks.do("measurement", self._require_measurement, lambda _: self._heard())
         checks.do("command", self._require_actuator, lambda _: self._served())
         checks.do(
             "alone",
@@ -277,14 +276,14 @@ class Readiness:
         period = last[1].period if last is not None else math.nan
         return Ready(parameters, baseline, policy, from_small, period)
 
-    def _require_measurement(self, timeout: float) -> None:
+    def _require_measurement(self) -> None:
         """Refuse a start without measurements, with the reason as far as the graph shows it."""
         node, ends = self._node, self._ends
         if node.get_parameter("use_sim_time").value and node.get_clock().now().nanoseconds == 0:
             raise NotReadyError(Code.NO_CLOCK())
         if dead := self._sensor.why_dead():
             raise NotReadyError(dead)
-        if (age := self._sensor.age) > timeout:
+        if (age := self._sensor.age) > self._sensor.timeout:
             why = why_no_publisher(node, ends.measurement.topic_name, ends.reader.type_name)
             raise NotReadyError(
                 Code.NO_MEASUREMENT_YET(why=why)

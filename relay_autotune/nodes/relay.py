@@ -390,7 +390,7 @@ class RelayNode(ServedNode):
             timeout = self.get_parameter("model_timeout").value
             return "" if waiting is None else waiting.recording.awaited(timeout)
         sentence = session.experiment.status
-        if (age := self._sensor.age) > SILENT:
+        if (age := self._sensor.age) > max(SILENT, 2.0 * self._sensor.samples.interval):
             sentence += f"; no measurement for {duration(age)}"
         lost = self._lost()
         return f"{sentence}; {Code.NOTE_LOST(samples=lost)}" if lost else sentence
@@ -418,7 +418,7 @@ class RelayNode(ServedNode):
         problems = [self._alarm] if self._alarm else []
         if self._sensor.misread:
             problems.append(str(self._sensor.misread))
-        elif self._sensor.age > self.get_parameter("measurement_timeout").value:
+        elif self._sensor.age > self._sensor.timeout:
             why = why_no_publisher(self, self._ends.measurement.topic_name, self._reader.type_name)
             problems.append(f"no measurement comes: {why}")
         problems += filter(None, (self._recordings.problem(), self._loop.problem))

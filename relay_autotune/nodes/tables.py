@@ -72,8 +72,9 @@ NODE_PARAMETERS = (
     Quantity("feedback_timeout", 1.0, "s", 1e-3).means(
         "Longest time beyond that tolerance; after it the actuator counts as stuck."
     ),
-    Quantity("measurement_timeout", 1.0, "s", 1e-3).means(
-        "Longest silence of the measurement; after it a tune is aborted."
+    Quantity("measurement_timeout", 1.0, "s", 0.0).means(
+        "Longest silence of the measurement; after it a tune is aborted. 0: five intervals of the "
+        "measurement, and at least 1 s."
     ),
     Quantity("model_timeout", 10.0, "s", 0.0).means(
         "Longest wait of the recording for model and gains after a tune, counted from the last "

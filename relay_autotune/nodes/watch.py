@@ -38,6 +38,10 @@ LOOK_EVERY, _LEAST_WAIT = 0.05, 1e-3
 _KEPT, _WINDOW = 2000, 10.0
 # The least time by which rest is told [s]: a drift shows in less only where it is fast.
 _LEAST_SPAN = 2.0
+# Longest silence of a sensor where measurement_timeout is 0: a time [s], or a number of usual
+# intervals if that is longer. Some samples in a row may be lost on the way, and the relay, which
+# switches at a sample, is then late by no more than these.
+LEAST_SILENCE, SILENT_INTERVALS = 1.0, 5.0
 # Rounding of equal times as floats of seconds since 1970 [s].
 _ROUNDING = 1e-6
 
@@ -156,6 +160,7 @@ class LastSamples:
 
     def __init__(self) -> None:
         self._kept: deque[tuple[float, float]] = deque(maxlen=_KEPT)
+        self._interval_before = 0.0
 
     def add(self, value: float, published_ns: int | None) -> None:
         """Take a measurement [y].
@@ -166,7 +171,8 @@ class LastSamples:
         self._kept.append((1e-9 * (published_ns or time.time_ns()), value))
 
     def forget(self) -> None:
-        """Start again, since the command will change."""
+        """Start again, since the command will change; the interval stays known."""
+        self._interval_before = self.interval
         self._kept.clear()
 
     @property
@@ -181,7 +187,9 @@ class LastSamples:
     @property
     def interval(self) -> float:
         """Mean interval of the samples [s]; 0: not known."""
-        return max(self._span, 0.0) / max(len(self._kept) - 1, 1)
+        if len(self._kept) < 2:
+            return self._interval_before
+        return max(self._span, 0.0) / (len(self._kept) - 1)
 
     @property
     def newest(self) -> float | None:
@@ -335,11 +343,17 @@ class Sensor:
         self.lost, self._arrived = 0, time.monotonic()
 
     @property
+    def timeout(self) -> float:
+        """Longest silence that is no fault [s]."""
+        given = float(self._node.get_parameter("measurement_timeout").value)
+        return given or max(LEAST_SILENCE, SILENT_INTERVALS * self.samples.interval)
+
+    @property
     def left(self) -> float:
         """For how long its silence is no fault yet [s]."""
         if self._repeater is not None:
             return math.inf
-        return float(self._node.get_parameter("measurement_timeout").value) - self.since_message
+        return self.timeout - self.since_message
 
     def problem(self) -> Reason | None:
         """Return why a tune must end: it is silent, or with repetition its publisher has left."""
@@ -357,9 +371,9 @@ def again(timer: Any, wait: float) -> None:
     timer.reset()
 
 
-# Longest time for which the samples' time may stand still: a multiple of measurement_timeout or
-# repeat_period, and at least a number of seconds. Then the largest ratio of steady time to the
-# samples' time: for gaps in the samples, and for the clock of a simulation.
+# Longest time for which the samples' time may stand still: a multiple of the sensor's longest
+# silence or of repeat_period, and at least a number of seconds. Then the largest ratio of steady
+# time to the samples' time: for gaps in the samples, and for the clock of a simulation.
 _STANDING, _LEAST_STANDING = 2.0, 5.0
 _SLACK, _SLACK_SIMULATED = 3.0, 100.0
 
@@ -541,12 +555,9 @@ class Overtime:
         self._elapsed = math.nan
 
     @classmethod
-    def of(cls, experiment: RelayExperiment, node: Node) -> Overtime:
-        """Return the limit that follows from the node's parameters."""
-        pauses = [
-            float(node.get_parameter(name).value)
-            for name in ("measurement_timeout", "repeat_period")
-        ]
+    def of(cls, experiment: RelayExperiment, node: Node, sensor: Sensor) -> Overtime:
+        """Return the limit that follows from the node's parameters and its sensor."""
+        pauses = sensor.timeout, sensor.repeat_period
         simulated = bool(node.get_parameter("use_sim_time").value)
         by_number = experiment.parameters.sample_period > 0.0
         return cls(

@@ -195,7 +195,7 @@ class Looker:
         self.claims = True
         return lambda: setattr(self, "claims", False)
 
-    def measured(self, topic: str, type_name: str, field: str) -> float:
+    def measured(self, topic: str, type_name: str, field: str, patience: float) -> float:
         return self.measures
 
     def require_uncontrolled(self) -> None:
@@ -237,6 +237,7 @@ def test_flags_become_limits_levels_topics_and_types_without_a_question() -> Non
         "command_min": "0.0",
         "command_max": "5.0",
         "amplitude": "0.0",
+        "measurement_timeout": "0.0",
         "measurement_type": "std_msgs/msg/Float32",
         "measurement_field": "data",
         "command_type": "std_msgs/msg/Float64",
@@ -257,6 +258,23 @@ def test_the_law_of_another_program_is_designed_for() -> None:
     given.law, given.sample_period = "simple_pid", 0.1
     words = TopicLoop(Looker(), given).arguments()["identifier_node"]
     assert {"law:=simple_pid", "sample_period:=0.1"} < set(words)
+
+
+@pytest.mark.parametrize(
+    ("words", "do"),
+    [
+        (("--measurement", "/a", "--command", "/b"), "give --measurement-timeout 5.0"),
+        ((), "type ros2 param set /tank/relay_node measurement_timeout 5.0"),
+    ],
+)
+def test_a_parameter_of_another_node_is_refused_with_what_sets_it(
+    words: tuple[str, ...], do: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ros = ("--ros-args", "-p", "measurement_timeout:=5.0")
+    with pytest.raises(SystemExit):
+        tune_loop.main(["--namespace", "tank", *words, *ros])
+    said = capsys.readouterr().err
+    assert said.endswith(f"-p measurement_timeout:=5.0 sets nothing in relay_node: {do}\n")
 
 
 def test_a_law_that_cannot_be_designed_for_is_refused_at_once() -> None:
@@ -588,7 +606,7 @@ def test_commands_within_messages_become_parameters() -> None:
     given = options(
         "--within", "0", "1", "--at", "0", "--command-within", "0", "1", "--field", "velocity[l]",
         "--command-field", "data[1]", "--command-message", "{data: [0, 0]}",
-        "--command-period", "0.1",
+        "--command-period", "0.1", "--measurement-timeout", "5",
     )  # fmt: skip
     client = Looker(kind="sensor_msgs/msg/JointState")
     client.takes = "std_msgs/msg/Float64MultiArray"
@@ -598,6 +616,7 @@ def test_commands_within_messages_become_parameters() -> None:
     # The value of a parameter is read as YAML once more.
     assert yaml.safe_load(yaml.safe_load(found["command_message"])) == {"data": [0, 0]}
     assert found["command_period"] == "0.1"
+    assert found["measurement_timeout"] == "5.0"
 
 
 def test_a_field_that_is_not_there_is_asked_for_or_named_by_its_flag(typed: list[str]) -> None:
@@ -643,6 +662,7 @@ def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
     (what, command), (then, told) = repeated(silent, None)
     assert (what, command, then) == ("run it again", again, "if it happens again")
     assert "ros2 topic hz /tank/level" in told and "the load of the machine" in told
+    assert told.endswith("for a longer silence give --measurement-timeout")
     assert repeated(ended(Code.CANCELLED()), None) == [("run it again", again)]
     found = ended(core.NONE, gains=PidGains(experiment_id="x"))
     assert repeated(found, None) == [("prove the gains", f"{again} --verify")]

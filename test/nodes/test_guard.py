@@ -18,6 +18,7 @@ from relay_autotune.nodes.watch import (
     FollowWatch,
     LastSamples,
     Overtime,
+    Sensor,
     namesake,
     second_publisher,
     second_source,
@@ -236,3 +237,17 @@ def test_a_tune_is_asked_for_once_every_other_publisher_must_be_known() -> None:
     with pytest.raises(StopIteration) as done:
         answer.send(None)
     assert done.value.value == (0.5, False)
+
+
+@pytest.mark.parametrize(
+    ("given", "every", "timeout"), [(0.0, 0.02, 1.0), (0.0, 2.0, 10.0), (1.0, 2.0, 1.0)]
+)
+def test_a_silence_is_measured_by_the_rate_of_the_sensor_unless_it_is_given(given, every, timeout):
+    values = {"repeat_period": 0.0, "measurement_timeout": given}
+    node = SimpleNamespace(get_parameter=lambda name: SimpleNamespace(value=values[name]))
+    sensor = Sensor(node, reader=None, repeat=None)
+    sensor.samples = samples_of(every, 30)
+    assert sensor.timeout == pytest.approx(timeout)
+    # A tune begins with no samples of its own.
+    sensor.samples.forget()
+    assert sensor.timeout == pytest.approx(timeout)

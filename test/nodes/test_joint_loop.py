@@ -18,6 +18,7 @@ from toolbox_pid import ToolboxPid
 
 from relay_autotune.cli import joint_tune
 from relay_autotune.cli.joint_tune import JointLoop
+from relay_autotune.cli.settings import Answers
 from relay_autotune.errors import LoopError
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.loop import laws
@@ -425,16 +426,17 @@ def test_an_opened_joint_without_limits_of_the_command_is_tuned_without_them() -
     loop = joint_loop(arm, arm, "arm", "arm_2")
     options = SimpleNamespace(
         open=True, amplitude=0.5, record_only=True, measurement=None, field="data", wait=0.0,
-        within=(-1.0, 2.0), command_within=None,
+        within=(-1.0, 2.0), command_within=None, measurement_timeout=5.0,
     )  # fmt: skip
     tune = SimpleNamespace(
-        _loop=loop, options=options, _manager=arm, _held=[math.nan], _baseline=0.0,
+        _loop=loop, options=options, answers=Answers(options), _manager=arm, _held=[math.nan],
+        _baseline=0.0,
         _client=SimpleNamespace(kind_of=lambda *_, **__: ""), _space="tune",
         _forward=SimpleNamespace(name="forward", needs=(loop.interface,)),
     )  # fmt: skip
     tune._opened_ends = lambda: JointLoop._opened_ends(tune)
     words = JointLoop.arguments(tune)["relay_node"]
-    assert "measurement_min:=-1.0" in words
+    assert {"measurement_min:=-1.0", "measurement_timeout:=5.0"} < set(words)
     assert not any(word.startswith("command_m") and "inf" in word for word in words)
 
 

@@ -250,3 +250,16 @@ def test_a_topic_that_is_not_there_is_told_with_the_nearest(rig: Rig) -> None:
     told = done.stderr.splitlines()[-1]
     assert told.startswith("tune_loop: /tank/levle has no publisher within 6 s")
     assert "type --measurement /tank/level" in told
+
+
+def test_a_sensor_of_less_than_one_sample_a_second_is_tuned(rig: Rig) -> None:
+    heard = rig.listen("/tank/valve", Float64, RELIABLE)
+    slow = {"sample_period": 1.2, "time_constants": [4.0], "dead_time": 1.0}
+    rig.start("plant_node", *TOPICS, **FAST | slow)
+    process = begun(rig, "--record-only")
+    # Each sample of the tune is answered: the sensor was silent for 1.2 s between two of them.
+    rig.until(lambda: len(heard) > 3 or process.poll() is not None, "answers", timeout=120.0)
+    process.send_signal(signal.SIGINT)
+    output, said = process.communicate(timeout=30.0)
+    assert "cancelled" in output, said
+    assert re.search(r"0\.8[34]\d* per second", " ".join(said.split())), said

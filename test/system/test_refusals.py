@@ -159,7 +159,7 @@ def set_parameter(rig: Rig, name: str, value: float) -> Any:
         ("amplitude", -1.0),
         ("amplitude", math.nan),
         ("cycle_tolerance", 1.5),
-        ("measurement_timeout", 0.0),
+        ("measurement_timeout", -1.0),
         ("measurement_timeout", math.nan),
         ("bias", math.inf),
         ("baseline", math.inf),
