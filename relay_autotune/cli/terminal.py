@@ -364,14 +364,20 @@ def asked_for_file(what: str, names: Collection[str]) -> str:
     _forget_typed()
     while True:
         answer = _input(f"{what}: file name, or another program [none]: ")
-        if answer.lower() in ("n", "no", "none"):
+        if answer.lower() in ("", "n", "no", "none"):
             return ""
-        if answer.lower() in names:
-            return answer.lower()
-        if answer.lower() not in ("y", "yes"):
-            return str(Path(answer).expanduser()) if answer else ""
-        told = "expected the name of a file, such as gains.yaml, or Enter for none"
-        print(told, file=sys.stderr)
+        program = answer.lower().replace("-", "_").replace(" ", "_")
+        if program in names:
+            return program
+        file = Path(answer).expanduser()
+        # A word with neither folder nor ending is a program that was mistyped.
+        if file.suffix or os.sep in answer:
+            return str(file)
+        told = (
+            f"{answer} is neither a program nor the name of a file: expected a file with its "
+            f"ending, such as gains.yaml, Enter for none, or one of {', '.join(names)}"
+        )
+        print("\n".join(broken(told, width())), file=sys.stderr)
 
 
 def agrees(question: str, *, yes: bool) -> bool:

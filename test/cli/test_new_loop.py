@@ -384,6 +384,12 @@ def test_neither_yes_nor_a_law_becomes_the_name_of_a_file(
     assert asked_for_file("Write", EXPORTS) == str(Path("~/gains.yaml").expanduser())
     assert "such as gains.yaml" in capsys.readouterr().err
     assert asked_for_file("Write", EXPORTS) == "iec_61131_3_pid"
+    typed[:0] = ["nonsense program", "Arduino", "simple-pid", "./gains"]
+    assert asked_for_file("Write", EXPORTS) == "simple_pid"
+    said = " ".join(capsys.readouterr().err.split())
+    assert "nonsense program is neither a program nor" in said
+    assert all(name in said for name in EXPORTS)
+    assert asked_for_file("Write", EXPORTS) == "gains"
     assert asked_for_file("Write", EXPORTS) == ""
     with pytest.raises(SystemExit):
         tune_loop.main(["--export", "iec_61131_3_pid"])
