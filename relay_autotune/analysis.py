@@ -261,12 +261,7 @@ class _Tuning:
         unseen = _unseen(found.record, self.task.options)
         if unseen:
             options = replace(options, loop_delay=options.loop_delay + 0.5 * unseen)
-            spread = unseen * ((np.arange(len(models)) + 0.5) / max(len(models), 1) - 0.5)
-            turned = (self.rng or np.random.default_rng(0)).permutation(spread)
-            models = tuple(
-                replace(m, dead_time=max(m.dead_time + float(late), 0.0))
-                for m, late in zip(models, turned, strict=True)
-            )
+            models = _spread_in_time(models, unseen, self.rng or np.random.default_rng(0))
         return DesignTask(
             model=chosen.model,
             options=options,
@@ -382,17 +377,7 @@ def _judged(
         return _without_gains(found, judgement)
     tuning.tell("designing the gains")
     shaping = Shaping(tuning.design_task(found), evidence, findings)
-    unseen = _unseen(found.record, tuning.task.options)
-    if unseen:
-        told = (
-            f"a change of the command may have come up to {digits(unseen, 3)} s before its row, "
-            f"since the controller is to run more often than these were written: the gains allow "
-            f"for as much more dead time; log faster, or add a row at each change"
-        )
-        chosen = found.models[0]
-        chosen = replace(chosen, warnings=(*chosen.warnings, told))
-        found = replace(found, models=(chosen, *found.models[1:]))
-    found = replace(found, shaping=shaping)
+    found = replace(_warned_of_rows(found, tuning.task.options), shaping=shaping)
     tuned = _tuned(found, shaping.task, tuning.rules)
     gains = tuned.best_gains
     if gains is None:
@@ -487,6 +472,37 @@ def _unseen(record: Record, options: DesignOptions) -> float:
     if not (record.is_table and options.sample_period > 0.0):
         return 0.0
     return max(_sampling_period(record) - options.sample_period, 0.0)
+
+
+def _spread_in_time(
+    models: Sequence[TransferFunction], unseen: float, rng: np.random.Generator
+) -> tuple[TransferFunction, ...]:
+    """Return models whose dead times are spread evenly over a time about their own.
+
+    :param models: n of them.
+    :param unseen: that time [s].
+    :param rng: decides which of them is how late.
+    """
+    late = rng.permutation(unseen * ((np.arange(len(models)) + 0.5) / len(models) - 0.5))
+    return tuple(
+        replace(m, dead_time=max(m.dead_time + float(by), 0.0))
+        for m, by in zip(models, late, strict=True)
+    )
+
+
+def _warned_of_rows(found: Analysis, options: DesignOptions) -> Analysis:
+    """Add to the selected model's warnings what its record does not show of the command."""
+    unseen = _unseen(found.record, options)
+    if not unseen:
+        return found
+    told = (
+        f"a change of the command may have come up to {digits(unseen, 3)} s before its row, "
+        "since the controller is to run more often than these were written: the gains allow "
+        "for as much more dead time; log faster, or add a row at each change"
+    )
+    chosen, *others = found.models
+    chosen = replace(chosen, warnings=(*chosen.warnings, told))
+    return replace(found, models=(chosen, *others))
 
 
 def _sampling_period(record: Record) -> float:

@@ -338,9 +338,8 @@ class FitContext:
         """
         problem = replace(candidate.problem, structure=FOPDT, colour=None)
         fopdt = self._fopdt_of(problem)
-        if any(nuisances_of(problem)):
-            # A FOPDT has the longest dead time of all, since it includes every small lag.
-            problem = drop_first_dead_time(problem, fopdt)
+        # A FOPDT has the longest dead time of all, since it includes every small lag.
+        problem = drop_first_dead_time(problem, fopdt)
         return replace(self, problem=problem, fopdt=fopdt, _fopdts={})
 
     def fit(
