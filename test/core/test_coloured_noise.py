@@ -15,7 +15,12 @@ from scipy.signal import lfilter
 
 from relay_autotune.analysis import analyse
 from relay_autotune.identification.known import NOTHING
-from relay_autotune.identification.waveform.candidates import FitContext, nuisances_of, support
+from relay_autotune.identification.waveform.candidates import (
+    Candidate,
+    FitContext,
+    nuisances_of,
+    support,
+)
 from relay_autotune.identification.waveform.choice import (
     _best_of_all,
     _compared,
@@ -271,13 +276,19 @@ def test_where_no_structure_fits_in_any_colour_the_noise_counts_as_white():
     assert np.all(np.isfinite(found.values))
 
 
-def test_a_model_whose_response_the_colour_explains_does_not_simulate():
+def fitted_to_two_steps() -> Candidate:
+    """Return the FOPDT of a test with two steps and white noise."""
     time = PERIOD * np.arange(600)
     u = PiecewiseConstant(np.array([6.0, 30.0]), np.array([1.0, 0.3]), 0.0)
     noise = 0.02 * np.random.default_rng(3).standard_normal(time.size)
     problem = problem_of([(time, response(PROCESS, time, u) + noise, u)], FOPDT)
-    context = FitContext.of(problem, 1, held=False)
-    (right,) = context.fit(["fopdt"])
+    (found,) = FitContext.of(problem, 1, held=False).fit(["fopdt"])
+    return found
+
+
+def test_a_model_whose_response_the_colour_explains_does_not_simulate():
+    right = fitted_to_two_steps()
+    problem = right.problem
     bent = replace(
         right, state=evaluate(problem, right.state.theta + np.array((math.log(3.0), 0.0)))
     )
@@ -288,12 +299,8 @@ def test_a_model_whose_response_the_colour_explains_does_not_simulate():
 
 def test_a_colour_counts_where_it_simulates_as_well_as_other_terms_do():
     """Beside a drift the best simulation is worse, and a worse model passed for as good."""
-    time = PERIOD * np.arange(600)
-    u = PiecewiseConstant(np.array([6.0, 30.0]), np.array([1.0, 0.3]), 0.0)
-    noise = 0.02 * np.random.default_rng(3).standard_normal(time.size)
-    problem = problem_of([(time, response(PROCESS, time, u) + noise, u)], FOPDT)
-    context = FitContext.of(problem, 1, held=False)
-    (right,) = context.fit(["fopdt"])
+    right = fitted_to_two_steps()
+    problem = right.problem
     late = replace(right, state=evaluate(problem, right.state.theta + np.array((0.0, 3.0))))
     likely = replace(late, score=right.score - 1e6)
     beside = _Reached(simulated=[late], coloured=[[likely]])
