@@ -302,13 +302,14 @@ class FitContext:
         return min(state, best_of(problem, starts), key=lambda s: s.cost)
 
     def _fopdt_of(self, problem: Problem) -> Trial:
-        """Return the best fit of a FOPDT with some terms, found once for each set of them.
+        """Return the best fit of a FOPDT with some terms, found once for the same samples.
 
-        :param problem: of this context's samples, with a FOPDT structure.
+        :param problem: of this context, with a FOPDT structure.
         """
-        key = (*nuisances_of(problem), problem.load)
         if not any(nuisances_of(problem)):
             return self.fopdt
+        # The samples of a first dead time may have been dropped.
+        key = (problem.time.size, problem.load, *nuisances_of(problem))
         if key not in self._fopdts:
             starts = [self.fopdt.theta, *start_fopdt(problem, self.sign)]
             self._fopdts[key] = best_of(problem, starts)
