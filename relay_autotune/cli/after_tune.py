@@ -63,10 +63,10 @@ from relay_autotune.control.verification import Step, allowed_steps, noise_of, p
 from relay_autotune.errors import RelayAutotuneError, SelectionError, TuningError
 from relay_autotune.exchange.export import (
     EXPORTS,
-    WITHOUT_LAW,
+    controller_file,
+    controller_values,
     exported,
     exports_of,
-    node_parameters,
 )
 from relay_autotune.exchange.messages import (
     gains_from_message,
@@ -76,7 +76,7 @@ from relay_autotune.exchange.messages import (
 from relay_autotune.loop.gains import Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes.gains_client import GainsClient
-from relay_autotune.nodes.tables import FIXED, GAINS, parameters_of_law, rate_of
+from relay_autotune.nodes.tables import parameters_of_law, rate_of
 from relay_autotune.reasons import Code
 from relay_autotune.record.record import Record
 from relay_autotune.text import digits, duration
@@ -439,9 +439,8 @@ class AfterTune:
         """
         chosen, own = first, exports_of(first.gains.law)
         names = ", ".join(name for name in EXPORTS if name != first.how)
-        whose = " of ros2_controllers" * (first.how == WITHOUT_LAW)
         print()
-        tell("file for", f"{first.how}{whose}; type another name to design for it: {names}")
+        tell("file for", f"{first.how}; type another name to design for it: {names}")
         while True:
             what = f"Write the gains for {chosen.how}{' all the same' * bool(against)}"
             answer = asked_for_file(what, EXPORTS)
@@ -480,36 +479,21 @@ class AfterTune:
 
     def _own_controller(self) -> Steps:
         """Return the commands that control the loop with the gains, without other controllers."""
-        client, options, gains = self.client, self.options, self.gains
-        names = ["measurement_type", "command_type"]
-        kind, command_kind = client.values(client.name, names).values()
-        default = {entry.name: entry.default for entry in FIXED}
-        sensor = {"measurement_type": kind, "measurement_field": options.field}
-        values: dict[str, Any] = {each.name: getattr(gains, each.name) for each in GAINS}
-        values |= {n: v for n, v in sensor.items() if v != default[n]}
-        values |= {"initial_command": options.at, "safe_command": options.at}
-        values |= {"initial_setpoint": float(f"{self.result.experiment.settings.setpoint:.6g}")}
-        # What a tune may see is not what the sensor can tell: beyond that the command is held.
-        values |= ranges(None, options.command_within)
-        values |= parameters_of_law(gains.law, gains.law_period)
-        topics, steps = {"measurement": options.measurement}, []
-        if command_kind == FLOAT64:
-            topics["controller_command"] = options.command
-        else:
-            # controller_node sends Float64 alone, and relay_node passes that on.
+        gains, target, steps = self.gains, self.loop.target, []
+        law = parameters_of_law(gains.law, gains.law_period)
+        target = replace(target, parameters={**target.parameters, **law})
+        if "controller_command" not in target.topics:
             given = self.loop.arguments()["relay_node"]
             words = [w for w in given if not w.startswith("__ns:=")]
-            words = [*words[1:], "-p", f"initial_command:={options.at}"]
+            words = [*words[1:], "-p", f"initial_command:={self.options.at}"]
             command = shlex.join(["relay_node", "--ros-args", *words])
             steps.append(("pass its commands on", prefix() + command))
         # The folder of the recording keeps what belongs to the tune.
-        bag, words = (
-            self.result.bag,
-            [CONTROLLER, "--ros-args", *ros_arguments("", topics, values)],
-        )
+        bag, values = self.result.bag, controller_values(gains, target)
+        words = [CONTROLLER, "--ros-args", *ros_arguments("", target.topics, values)]
         if bag and Path(bag).is_dir():
             file = str(Path(bag, f"{CONTROLLER}.yaml"))
-            write(node_parameters(gains, values, topics), file)
+            write(controller_file(gains, target), file)
             words = [CONTROLLER, "--gains", file]
         started = ("control with these gains", prefix() + shlex.join(words))
         return [started, ("set-points for it", f"{FLOAT64} on /setpoint"), *steps]

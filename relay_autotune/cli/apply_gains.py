@@ -146,12 +146,12 @@ def apply_at(
 
 
 def _write(client: GainsClient, options: argparse.Namespace) -> int:
-    from relay_autotune.exchange.export import Target, exported, exports_of
+    from relay_autotune.exchange.export import WITHOUT_LAW, Target, exported
     from relay_autotune.loop.laws import LAWS
 
     gains, doubt = client.waiting()
     _require_trust(doubt, options)
-    how = exports_of(gains.law)[0]
+    how = gains.law or WITHOUT_LAW
     write(exported(gains, how, Target(), doubt=doubt), options.file)
     load = f"; load it with ros2 param load /pid_controller {options.file}"
     print(f"written for {how}: {options.file}{load if LAWS[how].sets_gains else ''}")

@@ -19,6 +19,7 @@ from functools import cached_property
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
+from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.bag.field_path import first_numbers, unit_of_field
 from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, ros_arguments
 from relay_autotune.cli.settings import Answers, as_flags, flag_to_give
@@ -26,6 +27,7 @@ from relay_autotune.cli.terminal import UNITS, Working, asked, broken, width
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
 from relay_autotune.exchange.export import Target
 from relay_autotune.exchange.messages import reason_from_message
+from relay_autotune.nodes.tables import FIXED
 from relay_autotune.reasons import Code, Reason
 from relay_autotune.text import in_units
 
@@ -360,11 +362,27 @@ class TopicLoop(Loop):
 
     @property
     def target(self) -> Target:
-        """Where exported gains go: within the limits of the command, from the present one on."""
-        low, high = self.options.command_within or (-math.inf, math.inf)
-        at = math.nan if self.options.at is None else self.options.at
-        topics = {"measurement": self.options.measurement}
-        topics["controller_command"] = self.options.command
+        """Where exported gains go: within the limits of the command, from the present one on.
+
+        What a tune may see is not what the sensor can tell, so the measurement has no limits.
+        """
+        options, default = self.options, {entry.name: entry.default for entry in FIXED}
+        low, high = options.command_within or (-math.inf, math.inf)
+        sensor = {"measurement_type": self._kind, "measurement_field": options.field}
+        setpoint = self.client.result.experiment.settings.setpoint
+        topics = {"measurement": options.measurement}
+        # controller_node sends Float64 alone; relay_node passes that on as another type.
+        if self._command_kind == FLOAT64:
+            topics["controller_command"] = options.command
         return Target(
-            command_min=low, command_max=high, present=at, topics=topics, units=dict(UNITS)
+            command_min=low,
+            command_max=high,
+            present=options.at,
+            parameters={
+                **{name: value for name, value in sensor.items() if value != default[name]},
+                "safe_command": options.at,
+                "initial_setpoint": float(f"{setpoint:.6g}"),
+            },
+            topics=topics,
+            units=dict(UNITS),
         )

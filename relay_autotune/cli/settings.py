@@ -135,8 +135,8 @@ SETTINGS = (
         "do not ask, for scripts; gains are then proven with --verify alone"
     ),
     Setting("export", "", metavar="FILE").means(
-        "write the gains for ros2_controllers' pid_controller, or for the controller of the "
-        "joint; an existing file is refused at once"
+        "write the gains for controller_node, or for the controller of the joint; an existing "
+        "file is refused at once"
     ),
     Setting("accept_doubtful", False).means("with --export: also gains that are doubtful"),
 )  # fmt: skip

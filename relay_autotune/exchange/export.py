@@ -45,6 +45,7 @@ class Target:
     :param command_max: upper clamp of the command [u]; inf: none.
     :param present: the command at which the process rests [u]; NaN: not known.
     :param reach: the largest command of the record, without its sign [u]; NaN: not known.
+    :param parameters: of a controller_node by name, besides gains and limits of the command.
     :param topics: names of the topics of a controller_node, by their names without a remapping.
     :param units: of the measurement, by "y", and of the command, by "u", as far as known.
     :param is_set_up: True if the gains are for its rate and its strategy against windup, which a
@@ -59,6 +60,7 @@ class Target:
     command_max: float = math.inf
     present: float = math.nan
     reach: float = math.nan
+    parameters: Mapping[str, Any] = field(default_factory=dict)
     topics: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     is_set_up: bool = False
@@ -102,18 +104,21 @@ def _file(gains: Gains, how: str, target: Target) -> str:
     if how not in ((gains.law,) if gains.law else (WITHOUT_LAW, OWN_LAW)):
         runs = gains.law or "controller_node, as a continuous controller"
         raise SelectionError(f"the gains are for {runs}: give --law {how} to export them for it")
+    if how == OWN_LAW:
+        return controller_file(gains, target)
     law = LAWS[how]
     written = parameters if law.sets_gains else settings
     return written(gains, law, target)
 
 
 def exports_of(law: str) -> tuple[str, ...]:
-    """Return how gains for a law can be written.
+    """Return how gains for a law can be written, the usual way first.
 
     :param law: its name; empty: none was named.
     """
-    launched = (LAUNCH,) if law in ("", OWN_LAW) else ()
-    return (law or WITHOUT_LAW, "yaml", *launched)
+    if law not in ("", OWN_LAW):
+        return law, "yaml"
+    return (OWN_LAW, *[WITHOUT_LAW] * (not law), "yaml", LAUNCH)
 
 
 def file_name(how: str) -> str:
@@ -240,34 +245,35 @@ def _full_command(law: Law, target: Target) -> float:
     return max(limits)
 
 
-def node_parameters(gains: Gains, values: Mapping[str, Any], topics: Mapping[str, str]) -> str:
+# The section of a file for controller_node that no node has, for the names of topics.
+TOPICS = "/topics"
+
+
+def controller_file(gains: Gains, target: Target) -> str:
     """Return the parameters of a controller_node as a file that it is started with.
 
     ROS itself takes the parameters alone; `controller_node --gains FILE` takes the topics, too.
 
-    :param gains: that are among them.
-    :param values: the parameters by name.
-    :param topics: names of its topics, by their names without a remapping.
+    :param gains: that it runs.
+    :param target: its other parameters, its topics, and limits and present value of its command.
     """
     law = LAWS[OWN_LAW]
-    texts = [(n, number(v) if isinstance(v, float) else json.dumps(v)) for n, v in values.items()]
-    told = ("controller_node --gains FILE",)
-    text = _written(law, _comments(gains, told, law.remark), texts)
-    if not topics:
-        return text
-    lines = (law.line.format(name=name, value=json.dumps(to)) for name, to in topics.items())
-    return "\n".join([f"{text}{TOPICS}:", "  ros__parameters:", *lines]) + "\n"
+    more = [
+        law.line.format(name=name, value=number(value) if isinstance(value, float) else value)
+        for name, value in target.parameters.items()
+    ]
+    if target.topics:
+        more += [f"{TOPICS}:", "  ros__parameters:"]
+    more += [law.line.format(name=n, value=json.dumps(to)) for n, to in target.topics.items()]
+    text = "\n".join([settings(gains, law, target).rstrip(), *more])
+    return f"{law.remark} {OWN_LAW} --gains FILE\n{text}\n"
 
 
-# The section of that file which no node has, for the names of topics.
-TOPICS = "/topics"
+def controller_values(gains: Gains, target: Target) -> dict[str, Any]:
+    """Return the parameters of a controller_node that runs gains.
 
-
-def launch_file(gains: Gains, target: Target) -> str:
-    """Return a launch file that starts a controller_node with gains.
-
-    :param gains: of its own law.
-    :param target: its topics, and the limits and the present value of its command.
+    :param gains: that it runs.
+    :param target: as of :func:`controller_file`.
     """
     values = {n: float(f"{getattr(gains, n):.{_DIGITS}g}") for n in ("kc", "ti", "td", "tf", "b")}
     given = {
@@ -276,6 +282,16 @@ def launch_file(gains: Gains, target: Target) -> str:
         "command_max": target.command_max,
     }
     values |= {name: value for name, value in given.items() if math.isfinite(value)}
+    return values | dict(target.parameters)
+
+
+def launch_file(gains: Gains, target: Target) -> str:
+    """Return a launch file that starts a controller_node with gains.
+
+    :param gains: of its own law.
+    :param target: its topics, and the limits and the present value of its command.
+    """
+    values = controller_values(gains, target)
     shown = [f"                    {json.dumps(n)}: {v!r}," for n, v in values.items()]
     topics = [f"                    {(name, to)!r}," for name, to in target.topics.items()]
     lines = [

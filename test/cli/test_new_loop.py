@@ -639,6 +639,7 @@ def topic_loop(client: Any, given: argparse.Namespace) -> TopicLoop:
     """Return a loop that has been looked at."""
     loop = TopicLoop.__new__(TopicLoop)
     Loop.__init__(loop, client, given)
+    loop._kind, loop._command_kind = "std_msgs/msg/Float32", FLOAT64
     return loop
 
 
@@ -689,10 +690,9 @@ def shown(
     fill_gains(message, design(task, "imc"), experiment_id="x")
     result = Tune.Result(gains=message, verdict=Tune.Result.VERDICT_TRUSTED)
     result.experiment.settings.setpoint = 50.0
-    kinds = {"measurement_type": "std_msgs/msg/Float32", "command_type": FLOAT64}
     client: Any = SimpleNamespace(
         name="relay_node", result=result, record=lambda patience: record,
-        identifier_values=lambda patience: None, values=lambda node, names: kinds,
+        identifier_values=lambda patience: None,
     )  # fmt: skip
     parser = tune_loop._parser()
     given = parser.parse_args(["--measurement", "/tank/level", "--command", "/tank/valve"])
@@ -725,9 +725,9 @@ def shown(
         given.command_within = command_within
         given.export, given.accept_doubtful = export, accept_doubtful
         result.bag = tempfile.mkdtemp(dir=tmp_path) if bag is None else bag
-        kinds["command_type"] = command_type
         monkeypatch.setattr(AfterTune, "_offered", lambda _: (passed, against))
         loop = topic_loop(client, given)
+        loop._command_kind = command_type
         loop.nodes = nodes
         if at_joint:
             loop.proves = False
@@ -758,14 +758,19 @@ def test_gains_that_failed_are_not_recommended_and_their_file_says_so(
 ) -> None:
     failed = shown(False, "the step that was to prove them failed: it runs away", "failed.yaml")
     assert "the command stands at 35 u" in failed and "start your own" not in failed
-    assert f"pid_controller: {tmp_path / 'failed.yaml'}" in failed
+    assert f"controller_node: {tmp_path / 'failed.yaml'}" in failed
     assert failed.endswith("NEXT")
     first = (tmp_path / "failed.yaml").read_text().splitlines()[0]
     assert first == "# DOUBTFUL: the step that was to prove them failed: it runs away"
     assert "they are not proven" in shown(None, "few cycles", "")
     assert "start your own controller with these gains" in shown(True, "", "passed.yaml")
     text = (tmp_path / "passed.yaml").read_text()
-    assert "DOUBTFUL" not in text and "u_clamp_max: 100.0" in text
+    assert "DOUBTFUL" not in text and "command_max: 100.0" in text
+    # It is what a controller_node of this loop starts with.
+    words = with_gains_file(["--gains", "passed.yaml"])
+    assert words[-1] == "controller_command:=/tank/valve"
+    shown(True, "", "pid_controller", "other.yaml")
+    assert "u_clamp_max: 100.0" in (tmp_path / "other.yaml").read_text()
 
 
 def test_doubtful_gains_are_exported_unasked_by_a_flag_alone(

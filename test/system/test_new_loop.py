@@ -126,9 +126,9 @@ def test_the_session_of_the_tutorial_leads_to_proven_gains_and_leaves_nothing_ru
     # the model leaves counts as noise, too.
     height = re.search(r"set-point step +\+(\d[\d.]*) y: overshoot", screen)
     assert height and 0.6 < float(height[1]) < 1.6, screen
-    (settings,) = yaml.safe_load((rig.folder / "gains.yaml").read_text()).values()
-    p = settings["ros__parameters"]["gains"]["joint"]["p"]
-    assert p == pytest.approx(0.64, rel=0.5)
+    settings = yaml.safe_load((rig.folder / "gains.yaml").read_text())["/**"]["ros__parameters"]
+    assert settings["kc"] == pytest.approx(0.64, rel=0.5)
+    assert settings["safe_command"] == 2.0
     rig.until(lambda: heard[-1].data == 2.0, "the command that was said")
     ours = {"relay_node", "identifier_node", "controller_node", "tune_loop"}
     rig.until(lambda: not ours & set(rig.node.get_node_names()), "the end of its nodes")
