@@ -105,6 +105,21 @@ class ExperimentParameters:
         """True if the amplitude is not given, and the experiment finds it by itself."""
         return self.amplitude == 0.0
 
+    def band(self, noise_std: float) -> float:
+        """Return half the width of the relay's band [y].
+
+        :param noise_std: standard deviation of the noise [y].
+        """
+        return self.hysteresis if self.hysteresis > 0.0 else 3.0 * noise_std
+
+    def room(self, setpoint: float) -> float:
+        """Return the distance of the set-point to the nearest limit of the measurement [y].
+
+        :param setpoint: about which the relay switches [y].
+        """
+        room = min(setpoint - self.measurement_min, self.measurement_max - setpoint)
+        return min(room, self.max_deviation) if self.max_deviation > 0.0 else room
+
     @property
     def first_amplitude(self) -> float:
         """The amplitude with which the relay begins where it finds its own [u]."""

@@ -312,7 +312,7 @@ class Settle:
             settled_at=trace.seen[-1],
             kicked_at=trace.time[-1],
             setpoint=rest.mean if math.isnan(p.setpoint) else p.setpoint,
-            hysteresis=p.hysteresis if p.hysteresis > 0.0 else 3.0 * rest.noise_std,
+            hysteresis=p.band(rest.noise_std),
             sign=p.process_gain_sign,
         )
         return Left(Event.STEADY, facts)

@@ -422,16 +422,23 @@ def clear_swing(noise_std: float, hysteresis: float, measurement: FloatArray) ->
     )
 
 
-def ample_swing(clear: float, noise_std: float, room: float, measurement: FloatArray) -> float:
-    """Return the half swing at which the amplitude is large enough where no target is given [y].
+def sought_swing(
+    p: ExperimentParameters,
+    clear: float,
+    noise_std: float,
+    setpoint: float,
+    measurement: FloatArray,
+) -> float:
+    """Return the half swing at which an amplitude that is searched for is large enough [y].
 
+    :param p: the user's parameters.
     :param clear: half swing that is clear of noise, hysteresis and resolution [y].
     :param noise_std: standard deviation of the noise [y].
-    :param room: distance of the set-point to the nearest limit of the measurement [y].
+    :param setpoint: about which the relay switches [y].
     :param measurement: samples of the oscillation [y], shape (n,).
     """
     ample = _AMPLE * max(noise_std, _resolution(measurement))
-    return max(clear, min(ample, _OF_ROOM * room))
+    return p.target_amplitude or max(clear, min(ample, _OF_ROOM * p.room(setpoint)))
 
 
 def _resolution(measurement: FloatArray) -> float:

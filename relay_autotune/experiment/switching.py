@@ -30,8 +30,8 @@ from relay_autotune.experiment.relay_law import (
     DwellFilter,
     LoadCompensation,
     Relay,
-    ample_swing,
     clear_swing,
+    sought_swing,
 )
 from relay_autotune.experiment.settling import rest_state
 from relay_autotune.reasons import Code, Reason, Value
@@ -494,8 +494,8 @@ class Switching:
         if not levels.searching:
             return False, None
         half_swing, clear, y = self._last_swing()
-        noise = self.facts.rest.noise_std
-        least = setup.parameters.target_amplitude or ample_swing(clear, noise, self._room, y)
+        facts = self.facts
+        least = sought_swing(setup.parameters, clear, facts.rest.noise_std, facts.setpoint, y)
         if not levels.from_small and (why := levels.why_clipped(half_swing, settled=False)):
             return False, why
         levels.note_small(half_swing, clear)
@@ -517,13 +517,6 @@ class Switching:
         y = self._setup.trace.columns(first, last + 1)[1]
         clear = clear_swing(self.facts.rest.noise_std, self.facts.hysteresis, y)
         return 0.5 * float(y.max() - y.min()), clear, y
-
-    @property
-    def _room(self) -> float:
-        """Distance of the set-point to the nearest limit of the measurement [y]."""
-        p, middle = self._setup.parameters, self.facts.setpoint
-        room = min(middle - p.measurement_min, p.measurement_max - middle)
-        return min(room, p.max_deviation) if p.max_deviation > 0.0 else room
 
     def _cycle_that_ended(self) -> Cycle:
         setup, p, noise = self._setup, self._setup.parameters, self.facts.rest.noise_std

@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
@@ -24,7 +25,7 @@ from relay_autotune.experiment.faults import SafePolicy
 from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.phases import SETTLING_LIMIT, SMALL_CYCLES, how_long
-from relay_autotune.experiment.relay_law import Levels
+from relay_autotune.experiment.relay_law import Levels, clear_swing, sought_swing
 from relay_autotune.nodes.goals import refused
 from relay_autotune.nodes.loop_ends import LoopSupervisor, RelayTopics
 from relay_autotune.nodes.parameters import merged, values_of
@@ -237,7 +238,7 @@ class Readiness:
         checks.tell("at rest", _rest_of(self._sensor.samples))
         checks.tell("recording", _recording_in(values["record_directory"]))
         checks.tell("model", _identifier_of(self._node, self._ends.gains.topic_name))
-        checks.tell("expected", _expected(parameters, last))
+        checks.tell("expected", _expected(parameters, self._sensor.samples, last))
         checks.tell("time", self.time_of(ready, parameters))
         return None if checks.refusals else ready
 
@@ -470,15 +471,31 @@ def _identifier_of(node: Node, topic: str) -> str | Reason:
     return Code.NO_IDENTIFIER(where=named)
 
 
-def _expected(parameters: ExperimentParameters, last: tuple[float, Cycle] | None) -> str:
-    """Say how far the measurement will swing, by the last tune of the node.
+def _expected(
+    parameters: ExperimentParameters, samples: LastSamples, last: tuple[float, Cycle] | None
+) -> str:
+    """Say how far the measurement will swing: by the last tune, else as far as the levels grow.
 
     :param parameters: the experiment's parameters.
+    :param samples: the last measurements.
     :param last: amplitude of the last tune [u], and its last cycle; None: there is none.
     """
-    if last is None:
-        return "how far the measurement swings is not known before the first tune"
-    amplitude, cycle = last
-    ratio = parameters.amplitude / amplitude if parameters.amplitude else 1.0
-    swing = 0.5 * (cycle.peak_max - cycle.peak_min) * ratio
-    return f"a swing of about {swing:.2g} y each way in {duration(cycle.period)}, as last time"
+    if last is not None:
+        amplitude, cycle = last
+        ratio = parameters.amplitude / amplitude if parameters.amplitude else 1.0
+        swing = 0.5 * (cycle.peak_max - cycle.peak_min) * ratio
+        return f"a swing of about {swing:.2g} y each way in {duration(cycle.period)}, as last time"
+    low, high = parameters.measurement_min, parameters.measurement_max
+    limits = [f"{limit:g}" for limit in (low, high) if math.isfinite(limit)]
+    ends = f"; the tune ends at {' and '.join(limits)} y" if limits else ""
+    rest = samples.rest()
+    if rest is None or not parameters.finds_amplitude:
+        return f"how far the measurement swings is not known before the first tune{ends}"
+    seen, noise = np.array(samples.before()), rest.noise_std
+    clear = clear_swing(noise, parameters.band(noise), seen)
+    setpoint = rest.mean if math.isnan(parameters.setpoint) else parameters.setpoint
+    swing = sought_swing(parameters, clear, noise, setpoint, seen)
+    return (
+        f"the levels grow until the measurement swings {swing:.2g} y each way, and not at all if "
+        f"the first ones make more{ends}"
+    )

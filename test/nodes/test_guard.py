@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from virtual_tune import tuned
 
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.nodes import watch
+from relay_autotune.nodes.readiness import _expected
 from relay_autotune.nodes.relay import RelayNode
 from relay_autotune.nodes.watch import (
     Arrival,
@@ -23,6 +27,8 @@ from relay_autotune.nodes.watch import (
     second_publisher,
     second_source,
 )
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.reasons import Code
 
 LOW, HIGH = 0.5, 1.5
@@ -217,6 +223,26 @@ def test_rest_is_told_of_any_sensor_in_the_end(every, count, span):
     """A fast one has no samples of 2 s among those that are kept, a slow one few in 10 s."""
     rest = samples_of(every, count).rest()
     assert rest is not None and rest.span == pytest.approx(span, rel=0.01)
+
+
+@pytest.mark.parametrize("limit", [40.0, 0.9])
+def test_the_swing_is_told_before_the_tune_that_makes_it(limit: float) -> None:
+    """It grows to twenty times the noise, or as far as a third of the way to a limit."""
+    model, noise = TransferFunction.fopdt(0.5, 1.0, 0.5), 0.02
+    within = {"measurement_min": -limit, "measurement_max": limit}
+    asked = ExperimentParameters(command_min=-20.0, command_max=20.0, **within)
+    plant = VirtualProcess(model, disturbances=Disturbances(noise_std=noise), seed=4)
+    samples = LastSamples()
+    for k in range(100):
+        samples.add(plant.measure(0.05 * k), round(1e9 * (100.0 + 0.05 * k)))
+    told = _expected(asked, samples, None)
+    assert told.endswith(f"the tune ends at -{limit:g} and {limit:g} y")
+    swing = float(told.partition("swings ")[2].partition(" y")[0])
+    assert swing == pytest.approx(min(20.0 * noise, limit / 3.0), rel=0.15)
+    *_, last = tuned(model, asked, period=0.05, seed=4, noise_std=noise).cycles
+    assert 0.5 * (last.peak_max - last.peak_min) == pytest.approx(swing, rel=0.5)
+    given = replace(asked, amplitude=1.0)
+    assert "not known before the first tune; the tune ends at" in _expected(given, samples, None)
 
 
 def test_a_tune_is_asked_for_once_every_other_publisher_must_be_known() -> None:
