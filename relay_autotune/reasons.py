@@ -486,7 +486,7 @@ class Code(enum.IntEnum):
         "end the others (a killed one leaves the graph after 20 s)",
     )
     """Two sensors or simulated plants, or two controllers, on one topic, as after a launch that
-    crashed: ros2 topic info --verbose shows both."""
+    crashed."""
     NAMESAKE = _Row(
         252,
         "{count} nodes have the name {node}, expected one: a call reaches any of them",
@@ -610,7 +610,7 @@ class Code(enum.IntEnum):
     NO_IDENTIFIER = _Row(
         315,
         "no identifier_node: a recording alone, without model and gains",
-        "type: ros2 run relay_autotune identifier_node{where}",
+        "type: [{run}]identifier_node{where}",
     )
     """No identifier_node runs in that namespace, or it is not found yet."""
 

@@ -14,7 +14,6 @@ import json
 import math
 import os
 import shlex
-import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -79,6 +78,7 @@ from relay_autotune.nodes.gains_client import GainsClient
 from relay_autotune.nodes.tables import parameters_of_law, rate_of
 from relay_autotune.reasons import Code
 from relay_autotune.record.record import Record
+from relay_autotune.start import prefix
 from relay_autotune.text import digits, duration
 from relay_autotune.verdict import Verdict
 
@@ -217,11 +217,6 @@ class _Written:
     doubt: str
 
 
-def prefix() -> str:
-    """Return what stands before a command of this package where the shell does not find it."""
-    return "" if shutil.which("replay") else "ros2 run relay_autotune "
-
-
 @dataclass
 class AfterTune:
     """A tune that has ended, and what can be done with its gains.
@@ -278,7 +273,7 @@ class AfterTune:
             steps: Steps = []
             if self.loop.has_own_nodes and result.gains.experiment_id:
                 proven, steps = self.hand_over()
-            steps += next_commands(result, controllers, prefix(), flags, report)
+            steps += next_commands(result, controllers, flags, report)
             steps += self.repeated(proven)
             if steps:
                 print("\nNext:")
@@ -341,9 +336,7 @@ class AfterTune:
         steps = [*loop.first(), ("run it again", again)]
         if result.why.code == Code.SILENT_SENSOR:
             why = reason_from_message(result.why)
-            told = (
-                f"the sensor (ros2 topic hz {why['topic']}) and the load of the machine (uptime)"
-            )
+            told = f"the sensor of {why['topic']} (--dry-run tells its rate) and the load (uptime)"
             wait = f"for a longer silence {loop.to_type(why)}"
             steps.append(("if it happens again", f"look at {told}; {wait}"))
         return steps

@@ -77,7 +77,7 @@ class JointLoop(Loop):
             space, slash, controller = options.controller.rpartition("/")
             within = f"/{space.strip('/')}".rstrip("/") if slash else None
             self._manager = ControllerManager(
-                robot, options.controller_manager, within, options.wait
+                robot, options.controller_manager or "", within, options.wait
             )
             self._loop = joint_loop(robot, self._manager, controller, options.joint)
             if options.open:

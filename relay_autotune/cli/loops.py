@@ -22,13 +22,14 @@ from typing import TYPE_CHECKING, Any
 from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.bag.field_path import first_numbers, unit_of_field
 from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, ros_arguments
-from relay_autotune.cli.settings import Answers, as_flags, flag_to_give
+from relay_autotune.cli.settings import FLAGS, SETTING, Answers, as_flags
 from relay_autotune.cli.terminal import UNITS, Working, asked, broken, width
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
 from relay_autotune.exchange.export import Target
 from relay_autotune.exchange.messages import reason_from_message
 from relay_autotune.nodes.tables import FIXED
 from relay_autotune.reasons import Code, Reason
+from relay_autotune.start import typed_for_parameter
 from relay_autotune.text import in_units
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class Loop:
     :param options: of the command line, with all answers.
     """
 
-    form: tuple[str, ...] = ("amplitude",)
+    form: tuple[str, ...] = ("at", "within", "command_within", "amplitude")
     """Settings that may be changed before each tune."""
     has_own_nodes = False
     """Whether its nodes are those of this command."""
@@ -74,20 +75,31 @@ class Loop:
         if unknown := set(changed) - set(self.form):
             raise SelectionError(f"{', '.join(sorted(unknown))} is no setting of {self.title}")
         self.answers.take(changed)
+        self.client.set_values(self.client.name, self.answers.parameters(changed))
 
-    def limits(self) -> tuple[float, ...]:
-        """Return the lowest and the highest measurement that a tune may see; empty: not known."""
-        names = ("measurement_min", "measurement_max")
+    def lacking(self) -> list[str]:
+        """Return the questions that must be answered before a tune."""
+        return []
+
+    def look(self) -> None:
+        """Take the settings that relay_node has now."""
+        names = list(self.answers.parameters_of(self.form))
         with suppress(LoopError):
-            found = tuple(self.client.values(self.client.name, names, _ANSWERS).values())
-            return found if all(map(math.isfinite, found)) else ()
-        return ()
+            self.answers.read(self.client.values(self.client.name, names, _ANSWERS))
 
-    def hand_over(self) -> None:
-        """Leave the command to relay_node alone, once that is there.
+    def joined(self) -> None:
+        """Exchange settings with relay_node, once that is there: what is given goes to it.
 
-        :raises LoopError: if somebody else commands.
+        :raises LoopError: if it refuses them, or somebody else commands.
         """
+        options = self.options
+        # An amplitude is that of one tune, unless a page can start more.
+        names = [name for name in self.form if name != "amplitude" or options.web]
+        given = [n for n in (*names, "measurement_timeout") if SETTING[n].is_given(options)]
+        if given:
+            self.client.set_values(self.client.name, self.answers.parameters(given))
+        if options.web:
+            self.look()
 
     def plan(self) -> list[str]:
         """Return what the loop itself has to say of a tune, as lines of a checklist."""
@@ -111,9 +123,10 @@ class Loop:
 
     def to_type(self, why: Reason) -> str:
         """Return what sets the parameter that a reason names."""
-        if self.has_own_nodes:
-            return flag_to_give(why)
-        return f"type: ros2 param set {self.client.name} {why.typed}"
+        name, _, value = why.typed.partition(" ")
+        if name in FLAGS or self.has_own_nodes:
+            return f"give {FLAGS.get(name, name)}"
+        return typed_for_parameter(self.client.name, name, value)
 
     @contextmanager
     def opened(self) -> Iterator[Callable[[int], str]]:
@@ -173,7 +186,6 @@ class TopicLoop(Loop):
     :raises LoopError: if a topic is not there, or something is not known and nobody can be asked.
     """
 
-    form = ("at", "within", "command_within", "amplitude")
     has_own_nodes = proves = True
 
     def __init__(self, client: TuneClient, options: argparse.Namespace) -> None:
@@ -248,8 +260,15 @@ class TopicLoop(Loop):
         """The name of the loop for people."""
         return f"{self.options.measurement} -> {self.options.command}"
 
-    def hand_over(self) -> None:
-        """Leave the command to relay_node alone, once that is there.
+    def lacking(self) -> list[str]:
+        """Return the questions that must be answered before a tune."""
+        return self.answers.lacking(self.form)
+
+    def look(self) -> None:
+        """Leave the settings as they are: nobody else knows its relay_node."""
+
+    def joined(self) -> None:
+        """Leave the command to relay_node alone, which has the settings since its start.
 
         :raises LoopError: if somebody else commands.
         """
@@ -283,7 +302,6 @@ class TopicLoop(Loop):
             "measurement_timeout": 0.0,
             **self.answers.parameters(),
             "command_field": self._command_field,
-            "amplitude": options.amplitude,
             # Without an identifier_node it would wait for nothing.
             **({"model_timeout": 0.0} if options.record_only else {}),
         }
@@ -297,15 +315,6 @@ class TopicLoop(Loop):
             given = {name: value for name, value in asked_for.items() if value is not None}
             nodes["identifier_node"] = ros_arguments(space, values=given)
         return nodes
-
-    def set(self, changed: dict[str, Any]) -> None:
-        """Take other values of the settings of `form`, also in relay_node."""
-        super().set(changed)
-        self.client.set_values(self.client.name, self.answers.parameters(self.form[:3]))
-
-    def limits(self) -> tuple[float, ...]:
-        """Return the lowest and the highest measurement that a tune may see; empty: not known."""
-        return tuple(self.options.within or ())
 
     def left(self) -> str:
         """Return at which command the loop is left, and whether that is the right one."""

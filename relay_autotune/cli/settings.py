@@ -22,22 +22,41 @@ from relay_autotune.cli.terminal import UNITS, asked, number_of, pair_of
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import Quantity
-from relay_autotune.reasons import Reason
 from relay_autotune.text import unit_of
 
 NOT_GIVEN = math.nan
+
+
+class Kind(Enum):
+    """What a loop has: nodes that run, two topics alone, or a joint of ros2_control.
+
+    A joint's controller stays active in a tune, or is switched off for it.
+    """
+
+    NODES = "nodes"
+    TOPICS = "topics"
+    JOINT = "joint"
+    OPENED = "opened joint"
+
+
+_JOINTS = (Kind.JOINT, Kind.OPENED)
+_ALL = (Kind.NODES, *_JOINTS, Kind.TOPICS)
+# The relay commands the actuator itself.
+_COMMANDING = (Kind.OPENED, Kind.TOPICS)
 
 
 @dataclass(frozen=True)
 class Setting(Quantity):
     """One of the settings of a loop; a default of () stands for a range.
 
+    :param loops: which take it; the last one has its flag in the help.
     :param metavar: what its flag takes; empty: it follows from the unit.
     :param question: how it is asked for; empty: nobody asks for it.
     :param example: what may be typed.
     :param parameters: of relay_node that it sets, for a range the lower and the upper one.
     """
 
+    loops: tuple[Kind, ...] = (Kind.TOPICS,)
     metavar: str = ""
     question: str = ""
     example: str = ""
@@ -53,21 +72,29 @@ class Setting(Quantity):
         """Return the value of a text; None: it has none."""
         return pair_of if self.ends > 1 else number_of
 
+    @property
+    def unset(self) -> Any:
+        """The value without its flag."""
+        # A proof may be wanted, not wanted, or asked for.
+        no_value = self.default in ("", (), NOT_GIVEN) or self.name == "verify"
+        return None if no_value else self.default
+
+    def is_given(self, options: argparse.Namespace) -> bool:
+        """Return whether its flag was given."""
+        return bool(getattr(options, self.name) not in (None, self.unset))
+
     def add_to(self, group: argparse._ActionsContainer) -> None:
         """Add its flag to some others."""
-        default, how = self.default, dict[str, Any]()
+        default, how = self.default, dict[str, Any](default=self.unset)
         if self.ends > 1:
-            how = {"nargs": 2, "type": finite, "metavar": ("LOW", "HIGH")}
+            how |= {"nargs": 2, "type": finite, "metavar": ("LOW", "HIGH")}
         elif isinstance(default, bool):
-            # A proof may be wanted, not wanted, or asked for.
-            asks = self.name == "verify"
+            asks = self.unset is None
             how["action"] = argparse.BooleanOptionalAction if asks else "store_true"
-            how["default"] = None if asks else False
         elif self.choices:
-            how = {"choices": self.choices, "metavar": self.metavar}
+            how |= {"choices": self.choices, "metavar": self.metavar}
         else:
             how["metavar"] = self.metavar or self.unit.upper()
-            how["default"] = None if default in ("", NOT_GIVEN) else default
             if self.is_number:
                 how["type"] = finite
         group.add_argument(flag_of(self), dest=self.name, help=self.description, **how)
@@ -81,39 +108,47 @@ class Setting(Quantity):
 
 SETTINGS = (
     Setting(
-        "amplitude", 0.0, "u", example="0",
-        question="half the distance of the relay's two commands; 0: found by the tune",
+        "amplitude", 0.0, "u", example="0", parameters=("amplitude",),
+        question="half the distance of the relay's two commands; 0: found by the tune", loops=_ALL,
     ).means("half the distance of the two commands [u]; default: the node's parameter"),
-    Setting("measurement", "", metavar="TOPIC").means("topic that measures"),
+    Setting("measurement", "", metavar="TOPIC", loops=_COMMANDING).means("topic that measures"),
     Setting("command", "", metavar="TOPIC").means("topic that commands the actuator"),
     Setting(
         "field", "data", metavar="PATH", question="the number that measures",
-        parameters=("measurement_field",),
+        parameters=("measurement_field",), loops=_COMMANDING,
     ).means("the number in the messages of --measurement (%(default)s)"),
     Setting("command_field", "", metavar="PATH", parameters=("command_field",)).means(
         "the number in the messages of --command, such as linear.x"
     ),
-    Setting("command_message", "", metavar="YAML", parameters=("command_message",)).means(
+    Setting(
+        "command_message", "", metavar="YAML", parameters=("command_message",),
+        loops=_COMMANDING,
+    ).means(
         "what stands in their other elements, such as '{data: [0.0, 1.5]}'"
     ),
     Setting("command_period", NOT_GIVEN, "s", parameters=("command_period",)).means(
         "send the last command again after this time, for an actuator that stops without"
     ),
-    Setting("measurement_timeout", NOT_GIVEN, "s", parameters=("measurement_timeout",)).means(
+    Setting(
+        "measurement_timeout", NOT_GIVEN, "s", parameters=("measurement_timeout",), loops=_ALL,
+    ).means(
         "longest silence of the measurement; default: five of its intervals, and at least 1 s"
     ),
     Setting(
         "at", NOT_GIVEN, "u", question="present command, at which the process rests",
         # The safe command also where a controller_node in front of it has ended.
-        example="2.5", parameters=("baseline", "safe_command"),
-    ).means("the present command, at which the process rests"),
+        example="2.5", parameters=("baseline", "safe_command"), loops=(Kind.NODES, *_COMMANDING),
+    ).means(
+        "the present command, at which the process rests; where nodes run it becomes their "
+        "baseline, as limits become theirs"
+    ),
     Setting(
         "within", (), "y", question="lowest and highest measurement that the process may see",
-        example="30 50", parameters=("measurement_min", "measurement_max"),
+        example="30 50", parameters=("measurement_min", "measurement_max"), loops=_ALL,
     ).means("the tune ends where the measurement leaves these [y]"),
     Setting(
         "command_within", (), "u", question="lowest and highest command of the actuator",
-        example="0 5", parameters=("command_min", "command_max"),
+        example="0 5", parameters=("command_min", "command_max"), loops=(Kind.NODES, *_COMMANDING),
     ).means("no command beyond these is sent [u]"),
     Setting("law", "", choices=tuple(LAWS), metavar="LAW").means(
         "design the gains for the law of another program, such as simple_pid, and prove them with "
@@ -131,22 +166,37 @@ SETTINGS = (
         "the noise (forty if that is within a third of the way to a limit), as far as --within "
         "and --command-within allow"
     ),
-    Setting("yes", False).means(
+    Setting("yes", False, loops=_ALL).means(
         "do not ask, for scripts; gains are then proven with --verify alone"
     ),
-    Setting("export", "", metavar="FILE").means(
+    Setting("export", "", metavar="FILE", loops=(*_JOINTS, Kind.TOPICS)).means(
         "write the gains for controller_node, or for the controller of the joint; an existing "
         "file is refused at once"
     ),
-    Setting("accept_doubtful", False).means("with --export: also gains that are doubtful"),
+    Setting("accept_doubtful", False, loops=(*_JOINTS, Kind.TOPICS)).means(
+        "with --export: also gains that are doubtful"
+    ),
+    Setting("controller", "", metavar="NAME", loops=_JOINTS).means(
+        "an active pid_controller, or with --open a joint_trajectory_controller; of several "
+        "robots with its namespace, such as /robot1/wheel_pid"
+    ),
+    Setting("joint", "", metavar="NAME", loops=_JOINTS).means("the joint, or degree of freedom"),
+    Setting("controller_manager", "", metavar="NAME", loops=_JOINTS).means(
+        "full name of the controller_manager; default: the only one that is there"
+    ),
+    Setting("open", False, loops=_JOINTS).means(
+        "switch its controllers off for the tune, and command the joint itself; default: the "
+        "controller stays active, and its reference is moved"
+    ),
+    Setting("forward", "", metavar="NAME", loops=(Kind.OPENED,)).means(
+        "with --open: the controller that passes commands on; default: found"
+    ),
+    Setting("keep_gains", False, loops=_JOINTS).means(
+        "leave the gains of the controller as they are"
+    ),
 )  # fmt: skip
 SETTING = {each.name: each for each in SETTINGS}
 FLAGS = {name: flag_of(each) for each in SETTINGS for name in each.parameters}
-
-
-def flag_to_give(why: Reason) -> str:
-    """Return what to give in place of a node's parameter that a reason names."""
-    return f"give {FLAGS.get(why.parameter, why.parameter)}"
 
 
 def as_flags(text: str) -> str:
@@ -234,6 +284,16 @@ class Answers:
         fine = math.isnan(seen) or low <= seen <= high
         return "" if fine else f"{what.format(f'{seen:.6g}')}: give limits around it"
 
+    def read(self, values: Mapping[str, Any]) -> None:
+        """Take the settings that relay_node has.
+
+        :param values: its parameters by name.
+        """
+        for each in SETTINGS:
+            found = [values[name] for name in each.parameters[: each.ends] if name in values]
+            if len(found) == each.ends and all(map(math.isfinite, found)):
+                setattr(self.options, each.name, found if each.ends > 1 else found[0])
+
     def ask(self, name: str, what: str = "", example: str = "") -> None:
         """Ask for a value that is not known yet, and refuse one that cannot be.
 
@@ -262,10 +322,11 @@ class Answers:
         )  # fmt: skip
         self.take({name: value}, "typed")
 
-    def form(self, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+    def form(self, names: Sequence[str], *, needed: bool) -> Iterator[dict[str, Any]]:
         """Yield each of some settings as a form shows it.
 
         :param names: of the settings.
+        :param needed: whether each must have a value.
         """
         for name in names:
             setting, value = SETTING[name], self[name]
@@ -276,6 +337,7 @@ class Answers:
                 "values": value if setting.ends > 1 else [value],
                 "ends": setting.ends,
                 "now": self.now(name),
+                "needed": needed,
             }
 
     def lacking(self, names: Sequence[str]) -> list[str]:
@@ -286,6 +348,10 @@ class Answers:
         # An amplitude that is given is not searched for between the limits of the command.
         free = ("command_within",) if self["amplitude"] else ()
         return [SETTING[n].question for n in names if self[n] is None and n not in free]
+
+    def parameters_of(self, names: Sequence[str]) -> list[str]:
+        """Return the names of the parameters of relay_node that some settings set."""
+        return [parameter for name in names for parameter in SETTING[name].parameters]
 
     def parameters(self, names: Collection[str] = tuple(SETTING)) -> dict[str, Any]:
         """Return the parameters of relay_node that the known values set."""
@@ -310,94 +376,56 @@ def _numbers(value: Any) -> list[float]:
     return [float(each) for each in (value if isinstance(value, Sequence) else [value])]
 
 
-def add_settings(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of a loop that has no nodes yet.
-
-    :param parser: of tune_loop.
-    """
-    group = parser.add_argument_group(
+# The groups of flags: those of all loops stand before them.
+_GROUPS = {
+    Kind.TOPICS: (
         "a loop without nodes",
         "with --measurement and --command it starts relay_node and identifier_node itself, asks "
         "for what it must know, shows the plan, tunes, and ends them",
-    )
-    for each in SETTINGS:
-        # The amplitude is one for every loop.
-        each.add_to(parser if each.name == "amplitude" else group)
-
-
-def add_joint(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of a joint of ros2_control.
-
-    :param parser: of tune_loop.
-    """
-    group = parser.add_argument_group(
+    ),
+    Kind.OPENED: (
         "a joint of ros2_control",
         "with --controller and --joint it finds topics, limits and gains by itself, tunes, and "
         "applies and verifies the gains",
-    )
-    group.add_argument(
-        "--controller", metavar="NAME",
-        help="an active pid_controller, or with --open a joint_trajectory_controller; of several "
-        "robots with its namespace, such as /robot1/wheel_pid",
-    )  # fmt: skip
-    group.add_argument("--joint", metavar="NAME", help="the joint, or degree of freedom")
-    group.add_argument(
-        "--controller-manager", default="", metavar="NAME",
-        help="full name of the controller_manager; default: the only one that is there",
-    )  # fmt: skip
-    group.add_argument(
-        "--open", action="store_true",
-        help="switch its controllers off for the tune, and command the joint itself; default: "
-        "the controller stays active, and its reference is moved",
-    )  # fmt: skip
-    group.add_argument(
-        "--forward", metavar="NAME",
-        help="with --open: the controller that passes commands on; default: found",
-    )  # fmt: skip
-    group.add_argument(
-        "--keep-gains", action="store_true", help="leave the gains of the controller as they are"
-    )
+    ),
+}
 
 
-class Kind(Enum):
-    """What a loop has: its nodes, its two topics alone, or a joint of ros2_control."""
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of all loops.
 
-    NODES = "nodes"
-    TOPICS = "topics"
-    JOINT = "joint"
-
-
-# Flags of a loop without nodes that a joint takes with --open alone, and those it never takes.
-_OF_OPENED = ("measurement", "at", "command_within", "command_message", "forward")
-_OF_TOPICS = (
-    "command", "command_field", "command_period", "verify", "step", "law", "sample_period",
-)  # fmt: skip
+    :param parser: of tune_loop.
+    """
+    groups = {kind: parser.add_argument_group(*told) for kind, told in _GROUPS.items()}
+    for each in SETTINGS:
+        each.add_to(parser if each.name == "amplitude" else groups[each.loops[-1]])
 
 
 def kind_of(options: argparse.Namespace) -> Kind:
     """Return which kind of loop is to be tuned.
 
-    :param options: with the flags of `add_settings` and `add_joint`.
+    :param options: with the flags of `add_settings`.
     :raises SelectionError: if the flags do not go together.
     """
-    of_joint = options.open or options.forward or options.keep_gains or options.controller_manager
-    if options.controller or options.joint:
-        _require_joint(options)
-        return Kind.JOINT
-    if of_joint:
-        raise SelectionError("--open and the like are for a joint: give --controller, --joint")
-    if options.measurement and options.command:
-        return Kind.TOPICS
+    kind = Kind.NODES
     lacking = [f"--{name}" for name in ("measurement", "command") if not getattr(options, name)]
+    if options.controller or options.joint:
+        kind = Kind.OPENED if options.open else Kind.JOINT
+        _require_joint(options)
+    elif not lacking:
+        kind = Kind.TOPICS
     for each in SETTINGS:
-        # One with a default is not told from one that is not given.
-        if (
-            each.name not in ("amplitude", "field", "yes", "accept_doubtful")
-            and getattr(options, each.name) is not None
-        ):
-            told = f"is for a loop without nodes: give {' and '.join(lacking)}, too"
-            raise SelectionError(f"{flag_of(each)} {told}")
-    return Kind.NODES
+        if kind in each.loops or not each.is_given(options):
+            continue
+        if kind in _JOINTS:
+            what = "--open" if Kind.OPENED in each.loops else "a loop of two topics"
+            told = f"{what}: leave it out, since the controller tells it"
+        elif Kind.TOPICS in each.loops:
+            told = f"a loop without nodes: give {' and '.join(lacking)}, too"
+        else:
+            told = "a joint: give --controller and --joint, too"
+        raise SelectionError(f"{flag_of(each)} is for {told}")
+    return kind
 
 
 def _require_joint(options: argparse.Namespace) -> None:
@@ -414,10 +442,3 @@ def _require_joint(options: argparse.Namespace) -> None:
         raise SelectionError(
             "a joint is tuned in the terminal: leave out --web, and --json without --keep-gains"
         )
-    for name in (*_OF_TOPICS, *(() if options.open else _OF_OPENED)):
-        if getattr(options, name) is not None:
-            what = "a loop of two topics" if name in _OF_TOPICS else "--open"
-            raise SelectionError(
-                f"--{name.replace('_', '-')} is for {what}: leave it out, since the controller "
-                f"tells it"
-            )

@@ -34,12 +34,13 @@ from relay_autotune.cli.arguments import (
     say,
 )
 from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN, own_namespace
-from relay_autotune.cli.settings import FLAGS, Kind, add_joint, add_settings, kind_of
+from relay_autotune.cli.settings import FLAGS, Kind, add_settings, kind_of
 from relay_autotune.cli.terminal import Help, Working, agrees, require_new, width
 from relay_autotune.cli.tune_view import TICK, Shown, check_lines, follow
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
 from relay_autotune.reasons import Code
+from relay_autotune.start import typed_for_parameter
 
 if TYPE_CHECKING:
     from relay_autotune.cli.loops import Loop
@@ -110,9 +111,9 @@ def _require_no_parameter(
         if flag not in ("-p", "--param") or not is_set or name == "use_sim_time":
             continue
         node = "/".join(("", *filter(None, (options.namespace.strip("/"), options.node))))
-        do = f"type ros2 param set {node} {name} {value}"
-        if options.measurement or options.joint:
-            do = f"give {FLAGS[name]} {value}" if name in FLAGS else "leave it out"
+        do = f"give {FLAGS[name]} {value}" if name in FLAGS else "leave it out"
+        if name not in FLAGS and not (options.measurement or options.joint):
+            do = typed_for_parameter(node, name, value)
         parser.error(f"{flag} {given} sets nothing in relay_node: {do}")
 
 
@@ -157,7 +158,6 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     add_settings(parser)
-    add_joint(parser)
     add_web(parser, "serve a page on which tunes are started, watched and ended, until Ctrl-C")
     return parser
 
@@ -228,7 +228,7 @@ class Session:
         patience = self._started(loops)
         self._find(loops, patience)
         for each in loops:
-            each.hand_over()
+            each.joined()
         # A sensor that is slower than that needs a longer --wait.
         ready_within = max(self._options.wait, _READY_WITHIN)
         deadline = time.monotonic() + min(patience, ready_within)
@@ -285,7 +285,7 @@ class Session:
 
         if kind is Kind.TOPICS:
             return [TopicLoop(client(own_namespace(options)), options)]
-        if kind is Kind.JOINT:
+        if kind in (Kind.JOINT, Kind.OPENED):
             from relay_autotune.cli.joint_tune import JointLoop
 
             robot = self._joined(LoopClient, own_namespace(options), "", options.node, ros)
@@ -294,7 +294,8 @@ class Session:
             joint.client.left_behind = joint.left_behind
             return [joint]
         spaces = options.namespace.split(",") if options.web else [options.namespace]
-        return [Loop(client(space), options) for space in spaces]
+        # The loops of a page have settings of their own.
+        return [Loop(client(space), argparse.Namespace(**vars(options))) for space in spaces]
 
     def _started(self, loops: Sequence[Loop]) -> float:
         """Start the nodes of the command, and return how long to wait for all [s]."""

@@ -201,7 +201,9 @@ class _LoopOnPage:
 
     def _show_form(self) -> None:
         """Show the settings of the next tune."""
-        form = tuple(self._loop.answers.form(self._loop.form))
+        self._loop.look()
+        needed = self._loop.has_own_nodes
+        form = tuple(self._loop.answers.form(self._loop.form, needed=needed))
         if form != self._live.told.form:
             self._live.tell(form=form)
 
@@ -221,7 +223,7 @@ class _LoopOnPage:
 
     def _check(self) -> None:
         """Ask whether a tune could start, and how."""
-        if lacking := self._loop.answers.lacking(self._loop.form):
+        if lacking := self._loop.lacking():
             self._live.rest(
                 f"fill in the plan first (Start a tune): {'; '.join(lacking)}",
                 good=False, checks=(), checked=self._live.told.checked + 1, accepted=False,
@@ -237,7 +239,7 @@ class _LoopOnPage:
             checks=tuple(map(check_parts, self._loop.checklist(result))),
             checked=self._live.told.checked + 1,
             accepted=accepted,
-            limits=self._loop.limits(),
+            limits=tuple(self._options.within or ()),
         )
 
     def _tune(self) -> int:
@@ -250,7 +252,7 @@ class _LoopOnPage:
         live.tell(
             phase="tuning", state="", status="asking for the tune", tone="", progress=0.0,
             elapsed=0.0, cycles=(), process="", result=(), setpoint=math.nan, levels=(),
-            window=(live.now, 0.0), limits=self._loop.limits(),
+            window=(live.now, 0.0), limits=tuple(self._options.within or ()),
         )  # fmt: skip
         with ExitStack() as stack:
             client.ask(self._options.amplitude, dry_run=False)

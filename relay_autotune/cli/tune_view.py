@@ -27,6 +27,7 @@ from relay_autotune.exchange.messages import transfer_function_from_message
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.reasons import Code
+from relay_autotune.start import prefix
 from relay_autotune.text import LOGGED_EVERY, digits, duration, in_units
 from relay_autotune.verdict import Verdict
 
@@ -264,13 +265,12 @@ def model_lines(message: Any, paint: Paint, columns: int = WIDEST) -> list[str]:
 
 
 def next_commands(
-    result: Any, controllers: Sequence[str], prefix: str = "", flags: str = "", report: str = ""
+    result: Any, controllers: Sequence[str], flags: str = "", report: str = ""
 ) -> list[tuple[str, str]]:
     """Return the next commands, each with its purpose.
 
     :param result: a `Tune.Result`.
     :param controllers: full names of the controller_nodes that receive these gains.
-    :param prefix: put before the package's executables if the shell does not find them.
     :param flags: options with which `replay` and `report` give the identifier_node's result.
     :param report: the report that was written; empty: none.
     """
@@ -280,12 +280,12 @@ def next_commands(
     if result.bag and result.outcome == result.COMPLETED:
         bag = f"{shlex.quote(result.bag)} {flags}".rstrip()
         if result.transfer_function.experiment_id and not report:
-            steps.append(("see it in figures", f"{prefix}report {bag} -o report.html"))
-        steps.append(("see every method and rule", f"{prefix}replay {bag}"))
+            steps.append(("see it in figures", f"{prefix()}report {bag} -o report.html"))
+        steps.append(("see every method and rule", f"{prefix()}replay {bag}"))
     if result.gains.experiment_id:
         for name in controllers:
             namespace, _, node = name.rpartition("/")
-            words = [f"{prefix}apply_gains"]
+            words = [f"{prefix()}apply_gains"]
             words += ["--namespace", namespace] if namespace else []
             words += ["--node", node] if node != "controller_node" else []
             words += ["--accept-doubtful"] if result.verdict != Verdict.TRUSTED else []

@@ -35,6 +35,7 @@ from relay_autotune.nodes.tables import FIXED, GAINS, rate_from, rate_of
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import may_pass
 from relay_autotune.record.record import Record
+from relay_autotune.start import prefix
 from relay_autotune.text import TOLD_EVERY, duration, visible
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, Verification
@@ -105,7 +106,7 @@ class GainsClient(LoopClient):
             topics = [f"__ns:={space}"] * bool(space) + [f"measurement:={measurement}"]
             topics += [f"__node:={own}"] * (own != "controller_node")
             words = [f"-r {name}" for name in topics] + [f"-p {shlex.quote(v)}" for v in values]
-            return f": ros2 run relay_autotune controller_node --ros-args {' '.join(words)}"
+            return f": {prefix()}controller_node --ros-args {' '.join(words)}"
         return ""
 
     def waiting(self) -> tuple[Gains, str]:

@@ -34,6 +34,7 @@ from relay_autotune.nodes.tables import TUNE_PARAMETERS
 from relay_autotune.nodes.watch import LastSamples, Sensor, require_own_time
 from relay_autotune.reasons import NONE, Code, Reason, reason_of
 from relay_autotune.record.record import Cycle
+from relay_autotune.start import prefix
 from relay_autotune.text import duration
 from relay_autotune_msgs.msg import Reason as ReasonMessage
 from relay_autotune_msgs.srv import StartTune
@@ -468,7 +469,7 @@ def _identifier_of(node: Node, topic: str) -> str | Reason:
         return f"from {found}"
     there = node.get_namespace()
     named = "" if there == "/" else f" --ros-args -r __ns:={there}"
-    return Code.NO_IDENTIFIER(where=named)
+    return Code.NO_IDENTIFIER(where=named, run=prefix())
 
 
 def _expected(

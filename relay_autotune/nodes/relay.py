@@ -41,7 +41,7 @@ from relay_autotune_msgs.srv import StartTune
 # How long the end of the process waits for the acknowledgement of the record.
 ACKNOWLEDGE = Duration(seconds=0.2)
 # Where a tune that was started by the service is seen.
-WATCH = "the log of {}, or ros2 topic echo /diagnostics, which tell each second how it goes"
+WATCH = "the log of {}, or the topic /diagnostics, which tell each second how it goes"
 # Silence of the measurement that is told during a tune [s].
 SILENT = 0.5
 # How long the end of the process may wait for the last bytes of a recording [s].

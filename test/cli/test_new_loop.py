@@ -26,9 +26,10 @@ from made_experiments import record_of
 from rcl_interfaces.srv import SetParametersAtomically
 
 from relay_autotune import reasons as core
+from relay_autotune import start
 from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.cli import loops, report, settings, terminal, tune_loop
-from relay_autotune.cli.after_tune import AfterTune, prefix
+from relay_autotune.cli.after_tune import AfterTune
 from relay_autotune.cli.loops import Loop, TopicLoop
 from relay_autotune.cli.own_nodes import OwnNodes, namespace_of_joint, ros_arguments
 from relay_autotune.cli.settings import Kind, kind_of
@@ -60,6 +61,8 @@ from relay_autotune.verdict import Verdict
 from relay_autotune.web.live import Live
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains, Reason
+
+TOPICS = ("--measurement", "/a", "--command", "/b")
 
 
 def test_the_last_line_of_a_node_that_died_ends_every_wait_for_it() -> None:
@@ -261,20 +264,24 @@ def test_the_law_of_another_program_is_designed_for() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "do"),
+    ("words", "given", "has_ros2", "do"),
     [
-        (("--measurement", "/a", "--command", "/b"), "give --measurement-timeout 5.0"),
-        ((), "type ros2 param set /tank/relay_node measurement_timeout 5.0"),
+        (TOPICS, "measurement_timeout:=5.0", True, "give --measurement-timeout 5.0"),
+        ((), "measurement_timeout:=5.0", True, "give --measurement-timeout 5.0"),
+        (TOPICS, "hysteresis:=0.5", True, "leave it out"),
+        ((), "hysteresis:=0.5", True, "type: ros2 param set /tank/relay_node hysteresis 0.5"),
+        ((), "hysteresis:=0.5", False, "start /tank/relay_node with -p hysteresis:=0.5"),
     ],
 )
 def test_a_parameter_of_another_node_is_refused_with_what_sets_it(
-    words: tuple[str, ...], do: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    ros = ("--ros-args", "-p", "measurement_timeout:=5.0")
+    words: tuple[str, ...], given: str, has_ros2: bool, do: str,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.setattr(start, "which", lambda name: "/opt" if has_ros2 else None)
     with pytest.raises(SystemExit):
-        tune_loop.main(["--namespace", "tank", *words, *ros])
+        tune_loop.main(["--namespace", "tank", *words, "--ros-args", "-p", given])
     said = capsys.readouterr().err
-    assert said.endswith(f"-p measurement_timeout:=5.0 sets nothing in relay_node: {do}\n")
+    assert said.endswith(f"-p {given} sets nothing in relay_node: {do}\n")
 
 
 def test_a_law_that_cannot_be_designed_for_is_refused_at_once() -> None:
@@ -314,9 +321,9 @@ def test_a_loop_that_somebody_else_commands_is_refused_before_any_question(
     assert client.claims
     client.others = "/pid"
     with pytest.raises(LoopError, match="/pid commands"):
-        loop.hand_over()
+        loop.joined()
     client.others = ""
-    loop.hand_over()
+    loop.joined()
     assert not client.claims
 
 
@@ -399,7 +406,7 @@ def test_what_failed_names_the_flag_and_no_node_that_ends_with_the_command() -> 
     """What to set comes from the reason, whatever the line says."""
     node = Checklist(stops=False)
     node.tell("limits", Code.NO_LIMITS(missing="measurement_min", limit="measurement_min"))
-    node.tell("model", Code.NO_IDENTIFIER(where=""))
+    node.tell("model", Code.NO_IDENTIFIER(where="", run=""))
     node.tell("time", "; type: ros2 param set /t/relay_node amplitude A")
     answer = answer_of(node, accepted=True)
     own: Any = TopicLoop.__new__(TopicLoop)
@@ -409,10 +416,9 @@ def test_what_failed_names_the_flag_and_no_node_that_ends_with_the_command() -> 
     assert [model, time] == answer.checks[1:]
     other: Any = Loop.__new__(Loop)
     other.client = SimpleNamespace(name="/t/relay_node")
-    assert other.checklist(answer) == [
-        answer.checks[0] + "; type: ros2 param set /t/relay_node measurement_min LIMIT",
-        *answer.checks[1:],
-    ]
+    assert other.checklist(answer) == [limits, *answer.checks[1:]]
+    free = Code.LITTLE_SPACE(folder="/", free=0.1)
+    assert "relay_node" in other.to_type(free) and "record_directory" in other.to_type(free)
     # Another node's reason may lack a value.
     answer.refusals[0].names = answer.refusals[0].values = []
     assert own.checklist(answer) == answer.checks
@@ -540,11 +546,12 @@ def test_a_form_that_can_be_goes_to_relay_node_as_numbers() -> None:
     client.name, sent = "/tank/relay_node", {}
     client.set_values = lambda node, values: sent.update(values)
     loop = TopicLoop(client, options("--web"))
-    assert [row["values"] for row in loop.answers.form(loop.form)] == [[None], None, None, [0.0]]
+    form = list(loop.answers.form(loop.form, needed=True))
+    assert [row["values"] for row in form] == [[None], None, None, [0.0]]
     loop.set({"at": 2, "within": [30, 50], "command_within": [0, 5], "amplitude": 1})
     assert sent == {
         "baseline": 2.0, "safe_command": 2.0, "measurement_min": 30.0, "measurement_max": 50.0,
-        "command_min": 0.0, "command_max": 5.0,
+        "command_min": 0.0, "command_max": 5.0, "amplitude": 1.0,
     }  # fmt: skip
     assert all(isinstance(value, float) for value in sent.values())
     assert loop.options.amplitude == 1.0
@@ -600,12 +607,34 @@ def test_flags_of_a_new_loop_need_both_topics() -> None:
     with pytest.raises(SelectionError, match=r"--measurement .*: give --command, too"):
         kind_of(given)
     given.measurement = None
-    with pytest.raises(
-        SelectionError, match=r"--within .*: give --measurement and --command, too"
-    ):
-        kind_of(given)
-    given.within = None
     assert kind_of(given) is Kind.NODES
+    given.law = "simple_pid"
+    with pytest.raises(SelectionError, match=r"--law .*: give --measurement and --command, too"):
+        kind_of(given)
+
+
+def test_what_is_given_for_a_loop_whose_nodes_run_goes_to_them_and_the_rest_comes_from_them():
+    words = ("--at", "2", "--within", "30", "50", "--amplitude", "0.5")
+    present = {
+        "baseline": math.nan, "safe_command": 1.0, "measurement_min": -math.inf,
+        "measurement_max": math.inf, "command_min": 0.0, "command_max": 5.0, "amplitude": 1.0,
+    }  # fmt: skip
+    client: Any = SimpleNamespace(
+        name="/t/relay_node", set_values=lambda node, values: present.update(values),
+        values=lambda node, names, patience: {name: present[name] for name in names},
+    )  # fmt: skip
+    Loop(client, tune_loop._parser().parse_args(words)).joined()
+    assert (present["baseline"], present["measurement_max"]) == (2.0, 50.0)
+    # An amplitude is that of one tune.
+    assert (present["amplitude"], present["command_max"]) == (1.0, 5.0)
+    page = Loop(client, tune_loop._parser().parse_args(["--web"]))
+    page.joined()
+    assert page.options.command_within == [0.0, 5.0] and page.options.amplitude == 1.0
+    assert page.lacking() == []
+    present["measurement_min"] = -math.inf
+    page = Loop(client, tune_loop._parser().parse_args(["--web"]))
+    page.joined()
+    assert page.options.within is None and page.options.at == 2.0
 
 
 def test_commands_within_messages_become_parameters() -> None:
@@ -656,7 +685,7 @@ def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
     given.typed = words
     given.at, given.within, given.command_within = 2.0, [30.0, 50.0], [0.0, 5.0]
     again = (
-        f"{prefix()}tune_loop --measurement /tank/level --command /tank/valve "
+        f"{start.prefix()}tune_loop --measurement /tank/level --command /tank/valve "
         f"--at 2 --within 30 50 --command-within 0 5"
     )
     inside = SimpleNamespace(measurement=np.array([40.0]))
@@ -668,7 +697,8 @@ def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
     silent = ended(Code.SILENT_SENSOR(topic="/tank/level", silence=1.01))
     (what, command), (then, told) = repeated(silent, None)
     assert (what, command, then) == ("run it again", again, "if it happens again")
-    assert "ros2 topic hz /tank/level" in told and "the load of the machine" in told
+    # What can be typed on a machine without the ros2 command, too.
+    assert "the sensor of /tank/level (--dry-run tells its rate)" in told
     assert told.endswith("for a longer silence give --measurement-timeout")
     assert repeated(ended(Code.CANCELLED()), None) == [("run it again", again)]
     found = ended(core.NONE, gains=PidGains(experiment_id="x"))

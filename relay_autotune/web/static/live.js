@@ -439,8 +439,9 @@ export class Live {
   // The settings of the form; null: one of them is missing.
   settings() {
     const found = {};
-    for (const { name } of this.told.form) {
+    for (const { name, needed } of this.told.form) {
       const typed = [...document.querySelectorAll(`#form input[name=${name}]`)].map((input) => input.value.trim());
+      if (!needed && typed.every((text) => text === "")) continue;
       if (typed.some((text) => text === "" || !Number.isFinite(Number(text)))) return null;
       const numbers = typed.map(Number);
       found[name] = numbers.length > 1 ? numbers : numbers[0];
