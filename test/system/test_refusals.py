@@ -23,6 +23,7 @@ from std_msgs.msg import Float32, Float64
 
 from relay_autotune.exchange.messages import reason_from_message
 from relay_autotune.recordings import read_experiments
+from relay_autotune.start import prefix
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
 
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -48,7 +49,7 @@ def test_apply_gains_without_a_controller_node_says_how_to_start_one(idle: Rig) 
     )  # fmt: skip
     assert done.returncode == 1
     assert (
-        "Start it: ros2 run relay_autotune controller_node --ros-args "
+        f"Start it: {prefix()}controller_node --ros-args "
         "-r measurement:=/measurement -p initial_command:=0.0 -p command_min:=-2.0 "
         "-p command_max:=2.0, or name another"
     ) in done.stderr
