@@ -11,33 +11,23 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import shlex
 import sys
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.cli.apply_gains import found_entries
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, as_typed, exit_status, say
-from relay_autotune.cli.loops import PATIENCE, Loop, Steps
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, as_typed, say
+from relay_autotune.cli.loops import Steps
 from relay_autotune.cli.own_nodes import (
     PROGRAM,
-    START_WITHIN,
-    own_namespace,
-    own_node,
-    ranges,
     ros_arguments,
 )
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import (
-    UNITS,
     StatusLine,
     Working,
     agreed_step,
@@ -54,11 +44,9 @@ from relay_autotune.cli.tune_view import (
     check_lines,
     document,
     next_commands,
-    result_lines,
     wants_colour,
 )
-from relay_autotune.control.controller import Control
-from relay_autotune.control.verification import Step, allowed_steps, noise_of, plan, proving_step
+from relay_autotune.cli.tuned import CONTROLLER, Proof, Tuned
 from relay_autotune.errors import RelayAutotuneError, SelectionError, TuningError
 from relay_autotune.exchange.export import (
     EXPORTS,
@@ -68,136 +56,15 @@ from relay_autotune.exchange.export import (
     exports_of,
 )
 from relay_autotune.exchange.messages import (
-    gains_from_message,
     reason_from_message,
     transfer_function_from_message,
 )
 from relay_autotune.loop.gains import Gains
-from relay_autotune.loop.sampled import Limits
-from relay_autotune.nodes.gains_client import GainsClient
-from relay_autotune.nodes.tables import parameters_of_law, rate_of
+from relay_autotune.nodes.tables import parameters_of_law
 from relay_autotune.reasons import Code
-from relay_autotune.record.record import Record
 from relay_autotune.start import prefix
-from relay_autotune.text import digits, duration
+from relay_autotune.text import digits
 from relay_autotune.verdict import Verdict
-
-CONTROLLER = "controller_node"
-# A loop may take this many settling times to come to rest, and at least a time [s].
-_TIMES_SETTLING, _REST_WITHIN = 5.0, 60.0
-
-
-class Proof:
-    """A step of the set-point that is to prove gains for a loop that has been tuned.
-
-    :param loop: the loop.
-    :param message: the `PidGains`.
-    :param result: the `Tune.Result`.
-    :param record: its samples.
-    :raises RelayAutotuneError: if there is no such step.
-    """
-
-    def __init__(self, loop: Loop, message: Any, result: Any, record: Record) -> None:
-        self._loop, self._message = loop, message
-        options, gains = loop.options, gains_from_message(message)
-        model = transfer_function_from_message(result.transfer_function)
-        assert record.settings is not None, "gains come of a whole experiment"
-        self._rest = rest = record.settings
-        self._within = Limits(*options.within)
-        # Without limits the process has seen the levels of the relay.
-        self._commands = Limits(*(options.command_within or (rest.low, rest.high)))
-        limits = self._within, self._commands
-        self.noise_std = noise = noise_of(record.noise_std, result.transfer_function.residual_rms)
-        step = options.step or proving_step(record, model, *limits, noise)
-        if not step:
-            raise TuningError("the limits leave no room for a step: widen --within")
-        self.rate = rate_of(gains.law, gains.law_period)
-        control, period = Control(gains, self.rate), record.mean_interval
-        once = plan(control, model, Step(setpoint=1.0), period)
-        self.allowed = allowed_steps(record, model, *limits, once, noise)
-        self.step: float = options.step or self.allowed.nearest(step)
-        self.allowed.require(self.step)
-        wanted = plan(control, model, Step(setpoint=self.step), period)
-        # How long the loop takes to settle with the gains, and all of it [s].
-        known = math.isfinite(gains.settling_time)
-        self._settles = gains.settling_time if known else wanted.duration
-        self._takes = wanted.duration + 2.0 * self._settles
-        # The predicted range of the command [u].
-        self._expected = [self._commands.clip(rest.baseline + end) for end in wanted.command]
-
-    @property
-    def plan(self) -> str:
-        """What will move, how far and how long."""
-        options, commands = self._loop.options, self._commands
-        rest, (least, most) = self._rest, self._expected
-        runs = ""
-        if self.rate is not None:
-            runs = f", which runs {self.rate.law.name} every {self.rate.period:g} s,"
-        return (
-            f"A controller_node of this command{runs} takes the loop at "
-            f"{rest.setpoint:.6g} y and {rest.baseline:.6g} u, moves the set-point of "
-            f"{options.measurement} by {self.step:+g} y and back, and ends at "
-            f"{rest.baseline:.6g} u after about {duration(self._takes)}. {options.command} is "
-            f"expected from {least:.3g} to {most:.3g} u, never beyond "
-            f"{commands.low:g} to {commands.high:g} u."
-        )
-
-    @contextmanager
-    def controller(self, step: float, doubtful: bool) -> Iterator[GainsClient]:
-        """Start a controller_node in front of relay_node, and end it with the block.
-
-        :param step: of the set-point [y].
-        :param doubtful: whether the gains are.
-        """
-        loop, rest, within, commands = self._loop, self._rest, self._within, self._commands
-        client, options = loop.client, loop.options
-        kind = client.values(client.name, ["measurement_type"])["measurement_type"]
-        # The journal of proven and failed gains is that of this controller_node alone.
-        with (
-            tempfile.TemporaryDirectory() as journal,
-            GainsClient("", own_node(options, CONTROLLER), beside=client) as found,
-        ):
-            values = {
-                "initial_setpoint": rest.setpoint,
-                "initial_command": rest.baseline,
-                "safe_command": rest.baseline,
-                **ranges((within.low, within.high), (commands.low, commands.high)),
-                "verify_step_max": abs(step),
-                "measurement_type": kind,
-                "measurement_field": options.field,
-                "accept_doubtful": str(doubtful).lower(),
-                "record_directory": journal,
-            }
-            if self.rate is not None:
-                values |= parameters_of_law(self.rate.law.name, self.rate.period)
-            topics = {"measurement": options.measurement}
-            arguments = ros_arguments(own_namespace(options), topics, values)
-            loop.nodes.start(CONTROLLER, arguments)
-            try:
-                yield found
-            finally:
-                loop.nodes.end(CONTROLLER)
-
-    def made(
-        self,
-        controller: GainsClient,
-        step: float,
-        tell: Callable[[str], None],
-        leave: Callable[[], bool],
-    ) -> Any:
-        """Put the gains in force, make the step, and go back; return the `Verify.Result`.
-
-        :param controller: the controller_node, which was found.
-        :param step: of the set-point [y].
-        :param tell: called with what is waited for.
-        :param leave: returns True to end the step.
-        """
-        patience = max(_TIMES_SETTLING * self._settles, _REST_WITHIN)
-        with controller.offered(self._message) as gains:
-            found = controller.prove(step, 0.0, patience, tell, leave, gains)
-            controller.let_settle(self._settles, tell, "the loop goes back", leave)
-        return found
-
 
 _UNFINISHED = "the proof did not end"
 _FAILED = "the step that was to prove them failed: {}"
@@ -218,34 +85,13 @@ class _Written:
 
 
 @dataclass
-class AfterTune:
-    """A tune that has ended, and what can be done with its gains.
+class AfterTune(Tuned):
+    """What follows a tune in a terminal.
 
-    :param loop: that was tuned.
     :param parser: of the command line.
     """
 
-    loop: Loop
     parser: argparse.ArgumentParser
-
-    def __post_init__(self) -> None:
-        self.client, self.options = self.loop.client, self.loop.options
-
-    @cached_property
-    def result(self) -> Any:
-        """The `Tune.Result`."""
-        return self.client.result
-
-    @cached_property
-    def gains(self) -> Gains:
-        """The gains of the tune, which are there."""
-        return gains_from_message(self.result.gains)
-
-    @property
-    def doubt(self) -> str:
-        """Why the gains are doubtful; empty: they are trusted."""
-        trusted = self.result.verdict == Verdict.TRUSTED
-        return "" if trusted else str(self.result.verdict_reason)
 
     # The result.
 
@@ -254,14 +100,11 @@ class AfterTune:
         result, options, client = self.result, self.options, self.client
         for refused in sorted(client.refused):
             say(PROGRAM, refused)
-        if not result.experiment.experiment_id:
+        if not self.is_started:
             return self._nothing_started()
         if not options.json:
             paint = Paint(colour=wants_colour(sys.stdout.isatty(), os.environ))
-            ended = result.outcome == result.COMPLETED and not client.cancelled
-            left = "" if ended else self.loop.left()
-            lines = result_lines(result, client.cancelled, paint, width(), left)
-            print("\n".join(lines), flush=True)
+            print("\n".join(self.lines(paint, width())), flush=True)
             self._compare()
         flags, report = self._reported()
         # Gains of nodes that end with this command cannot be asked for later.
@@ -271,7 +114,7 @@ class AfterTune:
             print(json.dumps(document(result, client.name, client.cancelled, report)))
         else:
             steps: Steps = []
-            if self.loop.has_own_nodes and result.gains.experiment_id:
+            if self.loop.has_own_nodes and self.has_gains:
                 proven, steps = self.hand_over()
             steps += next_commands(result, controllers, flags, report)
             steps += self.repeated(proven)
@@ -279,10 +122,9 @@ class AfterTune:
                 print("\nNext:")
             for what, command in steps:
                 print(f"  {what:<26} {command}")
-        complete = result.gains.experiment_id or options.record_only
-        written = report or not options.report
-        found = client.succeeded and complete and written and proven is not False
-        return exit_status(found=found, doubtful=result.verdict == Verdict.DOUBTFUL)
+        complete = self.has_gains or options.record_only
+        written = bool(report) or not options.report
+        return self.status(found=complete and written and proven is not False)
 
     def _compare(self) -> None:
         """Show the gains in force beside the new ones, if a controller of the loop has some."""
@@ -352,26 +194,19 @@ class AfterTune:
                 told = f"no report: the tune was cancelled; {prefix()}report makes one"
                 say(PROGRAM, f"{told} of {result.bag}" if result.bag else told)
             return "", ""
-        with Working("asking identifier_node for its parameters"):
-            # Imported here, because it loads slowly.
-            from relay_autotune.cli.report import defaults, flags_of, report_of_tune
+        # Imported here, because it loads slowly.
+        from relay_autotune.cli.report import flags_of, report_of_tune
 
-            values = None if options.record_only else client.identifier_values(PATIENCE)
-        flags = flags_of(values) if values is not None else ""
+        flags = flags_of(self.values)
         if not options.report:
             return flags, ""
         try:
-            if values is None:
+            if self.asked_there is None:
                 say(PROGRAM, "no identifier_node answers: the report uses its default parameters")
+            source = result.bag or self.loop.title
             with Working("writing the report"):
-                record, source = client.record(PATIENCE), result.bag or self.loop.title
                 told = report_of_tune(
-                    replace(record, units=dict(UNITS)),
-                    values or defaults(),
-                    result,
-                    source,
-                    options.report,
-                    self.loop.present(),
+                    self.record, self.values, result, source, options.report, self.loop.present()
                 )
         except RelayAutotuneError as error:
             say(PROGRAM, f"no report: {error}")
@@ -451,16 +286,14 @@ class AfterTune:
     def _designed(self, law: str, against: str) -> _Written:
         """Design gains for the law of a program, from the record of the tune, and show them."""
         # Imported here, because it loads slowly.
-        from relay_autotune.cli.report import analysed_as_there, defaults
+        from relay_autotune.cli.report import analysed_as_there
 
-        record = self.client.record(PATIENCE)
-        interval = f"{record.mean_interval:.3g}"
+        interval = f"{self.record.mean_interval:.3g}"
         what = f"time between two runs of {law} [s]"
         period = asked(what, "--sample-period", interval, "0.1", _positive)
         with Working(f"designing for {law}") as working:
-            values = self.client.identifier_values(PATIENCE) or defaults()
-            asked_for = {**values, "law": law, "sample_period": period}
-            found = analysed_as_there(record, asked_for, working.at)
+            asked_for = {**self.values, "law": law, "sample_period": period}
+            found = analysed_as_there(self.record, asked_for, working.at)
         gains = found.best_gains
         if gains is None:
             raise RelayAutotuneError(found.reason)
@@ -525,8 +358,7 @@ class AfterTune:
             print()
             return None, doubt
         with Working("choosing the step"):
-            record = self.client.record(PATIENCE)
-            proof = Proof(self.loop, self.result.gains, self.result, record)
+            proof = Proof(self)
         step = proof.step
         if asks:
             question = f"Prove the gains now? {proof.plan} Ctrl-C ends it at once, likewise."
@@ -545,24 +377,21 @@ class AfterTune:
     def _made(self, proof: Proof, step: float) -> Any:
         """Make the step, and show what it has found."""
         shown = StatusLine()
-        with proof.controller(step, bool(self.doubt)) as controller:
-            with Working(f"starting {CONTROLLER}"):
-                controller.find(START_WITHIN)
+        with noted(lambda text: say(PROGRAM, text)) as leave:
             try:
-                with noted(lambda text: say(PROGRAM, text)) as leave:
-                    found = proof.made(controller, step, shown, leave)
+                found = proof.made(step, bool(self.doubt), shown, leave)
             finally:
                 shown.clear()
-            print()
-            for entry in found_entries(found, proof.noise_std):
-                tell(*entry)
-            if proof.rate is not None:
-                tell(
-                    "law",
-                    f"controller_node ran {proof.rate.law.name} every {proof.rate.period:g} s; "
-                    f"what your program does at a limit of the command was not tried",
-                )
-            return found
+        print()
+        for entry in found_entries(found, proof.noise_std):
+            tell(*entry)
+        if proof.rate is not None:
+            tell(
+                "law",
+                f"controller_node ran {proof.rate.law.name} every {proof.rate.period:g} s; "
+                f"what your program does at a limit of the command was not tried",
+            )
+        return found
 
     def _say_what_is_left(self, against: str) -> None:
         """Say in which state the plant is, when only relay_node holds its command.

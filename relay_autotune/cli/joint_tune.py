@@ -9,7 +9,7 @@ import argparse
 import json
 import math
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
@@ -17,7 +17,7 @@ import yaml
 
 from relay_autotune.cli.apply_gains import apply_at
 from relay_autotune.cli.arguments import say
-from relay_autotune.cli.loops import Loop, Steps
+from relay_autotune.cli.loops import Loop, Steps, WhyOver
 from relay_autotune.cli.own_nodes import (
     PROGRAM,
     START_WITHIN,
@@ -392,12 +392,8 @@ class JointLoop(Loop):
         return math.nan
 
     @contextmanager
-    def opened(self) -> Iterator[Callable[[int], str]]:
-        """Open the loop for a tune if that is asked for, and close it as soon as the relay ends.
-
-        :return: to be told the state of the tune at each look, tells why the tune has to end;
-            empty: it goes on.
-        """
+    def opened(self) -> Iterator[WhyOver]:
+        """Open the loop for a tune if asked for, and close it as soon as the relay ends."""
         loop, forward = self._loop, self._forward
         # It is closed with the block, however that ends.
         with ExitStack() as stack:

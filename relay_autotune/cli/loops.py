@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 # Purpose and text of each command that may follow.
 Steps = list[tuple[str, str]]
+# Told the state of a tune, tells why it has to end; empty: it goes on.
+WhyOver = Callable[[int], str]
 # How long to wait for what a node still has to answer, and at most while a page waits [s].
 PATIENCE, _ANSWERS = 5.0, 1.0
 
@@ -129,8 +131,8 @@ class Loop:
         return typed_for_parameter(self.client.name, name, value)
 
     @contextmanager
-    def opened(self) -> Iterator[Callable[[int], str]]:
-        """Return, for a tune, what tells why it has to end; empty: it goes on."""
+    def opened(self) -> Iterator[WhyOver]:
+        """Open the loop for a tune, if its kind needs that."""
         yield lambda _: self.nodes.why_lost("identifier_node")
 
     def left(self) -> str:

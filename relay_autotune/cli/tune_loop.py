@@ -33,13 +33,13 @@ from relay_autotune.cli.arguments import (
     guarded_in_graph,
     say,
 )
+from relay_autotune.cli.flow import checked, run
 from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN, own_namespace
 from relay_autotune.cli.settings import FLAGS, Kind, add_settings, kind_of
 from relay_autotune.cli.terminal import Help, Working, agrees, require_new, width
-from relay_autotune.cli.tune_view import TICK, Shown, check_lines, follow
+from relay_autotune.cli.tune_view import Shown, check_lines
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
-from relay_autotune.reasons import Code
 from relay_autotune.start import typed_for_parameter
 
 if TYPE_CHECKING:
@@ -325,16 +325,7 @@ class Session:
         """Show the plan of a tune, and return whether it is to start."""
         options, client = self._options, loop.client
         with Working("looking at the loop"):
-            while True:
-                found = client.check(options.amplitude)
-                # Right after its start the node does not know all of these yet.
-                awaited = {Code.REST_UNKNOWN, Code.NO_IDENTIFIER}
-                if options.record_only:
-                    awaited.remove(Code.NO_IDENTIFIER)
-                lacking = any(reason.code in awaited for reason in found.refusals)
-                if not (client.not_ready_yet or lacking) or time.monotonic() > deadline:
-                    break
-                time.sleep(TICK)
+            found = checked(loop, deadline)
         print("\n".join(check_lines(loop.checklist(found), width())), flush=True, file=sys.stderr)
         if not client.succeeded:
             say(PROGRAM, f"{loop.title} refuses: {client.result.reason}")
@@ -345,21 +336,15 @@ class Session:
         """Ask for the tune, and show it until its result is there."""
         from relay_autotune.nodes.lifetime import never_wait_for
 
-        options, client, signals = self._options, loop.client, self._signals
+        options, signals = self._options, self._signals
         shown = Shown(sys.stderr, live=sys.stderr.isatty() and not options.dry_run)
         if not options.dry_run:
             shown.say(f"tune of {loop.title}; Ctrl-C cancels it")
         # Signals must work even while writing to standard error would block.
         wait_again = never_wait_for(sys.stderr.fileno())
         try:
-            with nullcontext(lambda _: "") if options.dry_run else loop.opened() as why_over:
-                while True:
-                    client.ask(options.amplitude, options.dry_run)
-                    follow(client, shown, signals.came, why_over=why_over)
-                    if signals.came or not client.not_ready_yet or time.monotonic() > deadline:
-                        break
-                    time.sleep(TICK)
-                shown.clear()
+            run(loop, shown, signals.came, deadline)
+            shown.clear()
         finally:
             wait_again()
 

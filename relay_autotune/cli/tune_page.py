@@ -22,12 +22,12 @@ from functools import partial
 from typing import Any, TypeVar
 
 from relay_autotune.analysis import options_from
-from relay_autotune.cli.after_tune import CONTROLLER, Proof
 from relay_autotune.cli.apply_gains import found_entries, verdict_entries
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, exit_status, say, worst
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say, worst
+from relay_autotune.cli.flow import checked, run
 from relay_autotune.cli.loops import Loop
-from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN
-from relay_autotune.cli.report import analysed_as_there, defaults, flags_of
+from relay_autotune.cli.own_nodes import PROGRAM
+from relay_autotune.cli.report import analysed_as_there, flags_of
 from relay_autotune.cli.terminal import UNITS
 from relay_autotune.cli.tune_view import (
     STATES,
@@ -35,10 +35,9 @@ from relay_autotune.cli.tune_view import (
     Shown,
     check_parts,
     estimate,
-    follow,
     oscillation,
-    result_lines,
 )
+from relay_autotune.cli.tuned import Proof, Tuned
 from relay_autotune.errors import LoopError, RelayAutotuneError, TuningError
 from relay_autotune.exchange.messages import (
     fill_gains,
@@ -52,7 +51,6 @@ from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.nodes.gains_client import GainsClient
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import process_text
-from relay_autotune.record.record import Record
 from relay_autotune.report.case import Case, EstimatedQuantity, case_of, model_case
 from relay_autotune.result import Analysis
 from relay_autotune.text import digits
@@ -230,7 +228,7 @@ class _LoopOnPage:
             )  # fmt: skip
             return
         self._live.tell(phase="checking", status="looking at the loop", tone="")
-        result = self._client.check(self._options.amplitude)
+        result = checked(self._loop, 0.0)
         accepted = self._client.succeeded
         self._live.forget_wishes()
         self._live.rest(
@@ -255,21 +253,20 @@ class _LoopOnPage:
             window=(live.now, 0.0), limits=tuple(self._options.within or ()),
         )  # fmt: skip
         with ExitStack() as stack:
-            client.ask(self._options.amplitude, dry_run=False)
             # Only once it has begun: see TuneClient.command_watch.
             self._at_first = lambda: stack.enter_context(self._commands_shown())
-            follow(client, self, self._ends, _TICK)
+            run(self._loop, self, self._ends, tick=_TICK)
             self._terminal.clear()
         if not live.told.window[1]:
             live.tell(window=(live.told.window[0], live.now))
-        result = client.result
+        tune = Tuned(self._loop)
+        result = tune.result
         for refused in sorted(client.refused):
             say(PROGRAM, refused)
-        if not result.experiment.experiment_id:
+        if not tune.is_started:
             live.rest(f"refused: {result.reason}", good=False)
             return NOTHING_FOUND
-        left = "" if result.outcome == result.COMPLETED else self._loop.left()
-        lines = result_lines(result, client.cancelled, Paint(), left=left)
+        lines = tune.lines(Paint())
         print("\n".join(lines), flush=True)
         live.tell(
             phase="analysing",
@@ -280,18 +277,18 @@ class _LoopOnPage:
             # A short tune ends before any model came.
             cycles = len(live.told.cycles)
             live.tell(process=self._show(result.transfer_function, cycles))
-            self._add_subject(result)
-        done = client.succeeded and bool(result.gains.experiment_id)
-        self._gains.look_after_tune()
+            self._add_subject(tune)
+        done = client.succeeded and tune.has_gains
+        self._gains.look_after_tune(tune)
         live.forget_wishes()
-        if left:
+        if tune.left:
             # What the plant does now matters more than the tune.
             live.tell(window=())
-        ended = "; ".join(filter(None, (f"no gains: {result.reason}", left)))
+        ended = "; ".join(filter(None, (f"no gains: {result.reason}", tune.left)))
         live.rest("the tune is complete" if done else ended, good=done)
-        return exit_status(found=done, doubtful=result.verdict == Verdict.DOUBTFUL)
+        return tune.status(found=done)
 
-    # The progress of a tune, see `follow`.
+    # The progress of a tune: a `Face`.
 
     def take(self, feedback: Any) -> None:
         """Show a feedback."""
@@ -366,11 +363,10 @@ class _LoopOnPage:
 
     # The result of a tune.
 
-    def _add_subject(self, result: Any) -> None:
+    def _add_subject(self, tune: Tuned) -> None:
         """Show the model of the tune, and let its gains be shaped; other rules come later."""
         try:
-            record = replace(self._client.record(_PATIENCE), units=dict(UNITS))
-            values = self._client.identifier_values(_PATIENCE) or defaults()
+            record, values = tune.record, tune.values
             found = _awaited(
                 self._client,
                 self._page.slow.ask(partial(analysed_as_there, record, values, alone=True)),
@@ -379,8 +375,7 @@ class _LoopOnPage:
         except RelayAutotuneError as error:
             say(PROGRAM, f"the gains cannot be shaped: {error}")
             return
-        bag = result.bag
-
+        bag = tune.result.bag
         options = found.shaping.task.options if found.shaping else options_from(values)
         first = DesignRequest.of(values["rule"], options)
 
@@ -455,8 +450,8 @@ class GainsPage:
     _looked: float = -math.inf
     # The usual step [y]; None: to be read anew.
     _step: float | None = None
-    # The `Tune.Result` of the last tune with gains, and its samples.
-    _tuned: tuple[Any, Record] | None = None
+    # The last tune with gains.
+    _tuned: Tuned | None = None
 
     def close(self) -> None:
         """Leave the controller."""
@@ -502,15 +497,17 @@ class GainsPage:
                     subject.case = replace(subject.case, present=present)
         self._looked = time.monotonic()
 
-    def look_after_tune(self) -> None:
-        """Read the gains in force, and the usual step, which comes of the tune."""
+    def look_after_tune(self, tune: Tuned) -> None:
+        """Read the gains in force, and the usual step, which comes of the tune.
+
+        :param tune: that has ended.
+        """
         self._step = None
         self.look()
-        result = self.loop.client.result
-        if self.loop.proves and result.gains.experiment_id:
+        if self.loop.proves and tune.has_gains:
             try:
-                self._tuned = result, self.loop.client.record(_PATIENCE)
-                step = Proof(self.loop, result.gains, *self._tuned).step
+                self._tuned = tune
+                step = Proof(tune).step
             except RelayAutotuneError as error:
                 say(PROGRAM, f"the gains cannot be proven: {error}")
                 self.live.tell(proves=False)
@@ -567,14 +564,11 @@ class GainsPage:
         self._begin_step("choosing the step")
         if self._tuned is None:
             raise TuningError("there are no gains of a tune that could be proven here")
-        proof = Proof(self.loop, message, *self._tuned)
-        proof.allowed.require(wish.step)
-        with proof.controller(wish.step, wish.doubtful) as controller:
-            live.tell(status=f"starting {CONTROLLER}")
-            controller.find(START_WITHIN, self.leave)
-            told = partial(live.tell, phase="verifying")
-            result = proof.made(controller, wish.step, lambda text: told(status=text), self.leave)
-            live.show("proof", [_document(step) for step in controller.steps_of(result)])
+        proof = Proof(self._tuned, message)
+        result = proof.made(
+            wish.step, wish.doubtful, lambda text: live.tell(status=text), self.leave,
+            lambda steps: live.show("proof", [_document(step) for step in steps]),
+        )  # fmt: skip
         left = f"the command stands at {self.loop.options.at:.6g} u"
         live.rest(
             f"proof {'passed' if result.passed else 'failed'}: {result.reason}; {left}",

@@ -12,17 +12,15 @@ import math
 import os
 import shlex
 import shutil
-import signal
 import textwrap
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
 from relay_autotune.cli.table import gains_lines
 from relay_autotune.cli.terminal import UNITS, WIDEST, labelled
-from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import transfer_function_from_message
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
@@ -31,17 +29,12 @@ from relay_autotune.start import prefix
 from relay_autotune.text import LOGGED_EVERY, digits, duration, in_units
 from relay_autotune.verdict import Verdict
 
-if TYPE_CHECKING:
-    from relay_autotune.nodes.tune_client import TuneClient
-
 # By the constants of Tune.Feedback and RelayExperiment.
 STATES = ("unknown", "settling", "kick", "relay", "completed", "aborted", "failed")
 OUTCOMES = ("unknown", "completed", "aborted", "failed")
 # Reasons whose sentence begins with the outcome.
 _OUTCOME_OF = {Code.CANCELLED: "cancelled", Code.REQUESTED: "aborted"}
 
-# Time between two updates of a terminal [s].
-TICK = 0.25
 # Columns that a terminal needs for lines that are updated in place.
 NARROWEST = 80
 
@@ -383,41 +376,3 @@ class Shown:
         with suppress(OSError):
             self._stream.write(in_units(text, UNITS))
             self._stream.flush()
-
-
-def follow(
-    client: TuneClient,
-    shown: Any,
-    interrupted: list[int],
-    tick: float = TICK,
-    why_over: Callable[[int], str] = lambda _: "",
-) -> None:
-    """Show the feedback until the result is there, and cancel when asked to.
-
-    :param client: that has asked for the tune.
-    :param shown: where the feedback goes, as :class:`Shown`.
-    :param interrupted: signals that have come.
-    :param tick: interval of the looks [s].
-    :param why_over: told the state of the tune at each look, tells why it has to end by itself;
-        empty: it goes on.
-    """
-    asked = state = 0
-    while not client.done():
-        client.spin(tick)
-        for feedback in client.news():
-            shown.take(feedback)
-            state = feedback.state
-        shown.tick()
-        over = why_over(state)
-        if (interrupted or over) and not asked:
-            asked = 1
-            client.cancel()
-            if over:
-                shown.say(over)
-            shown.say("cancelling: the safe command goes out, then the recording is closed")
-        elif any(number != signal.SIGHUP for number in interrupted[1:]):
-            # SIGHUP does not count: a shell that ends with its terminal sends it once more.
-            raise LoopError(
-                f"stopped waiting; {client.name} still sends the safe command, and its log says "
-                f"how the tune ended"
-            )
