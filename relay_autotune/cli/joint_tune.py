@@ -226,9 +226,8 @@ class JointLoop(Loop):
         yield "law", f"{loop.law}, every {1000.0 * loop.period:.4g} ms"
         yield (
             "derivative",
-            f"of the second interface, without a filter. No law has that, since the rate is a "
-            f"measurement of its own: the design takes the difference of {loop.measured}, which "
-            f"is half a period later. Without derivative action it is exact"
+            f"minus the velocity state, without a filter. The design takes the difference of "
+            f"{loop.measured} for it, which is that or half a period late"
             if loop.has_rate
             else "the plain difference of the error: noise passes, and PI is chosen where that "
             "is too much",

@@ -600,26 +600,42 @@ _SHARES = (
     "measurement over that of its command."
 )
 _TOOLBOX = "control_toolbox::Pid of ros-controls, 4.11.0 (branch jazzy)"
-_LATE = "u_k = p e_k + I_k + d (e_k - e_{k-1})/h, then I_{k+1} = I_k + i h e_k"
-_EARLY = "I_k = I_{k-1} + i h e_k, then u_k = p e_k + I_k + d (e_k - e_{k-1})/h"
+_CONTROLLERS = "ros2_controllers, 4.42.1 (branch jazzy),"
 _ON_Y = "I_k = I_{k-1} + i h e_k, then u_k = p (b r_k - y_k) + I_k - d (y_k - y_{k-1})/h"
 
 
 def _control_toolbox(
-    name: str,
-    limits: str,
-    *others: Setting,
-    equation: str = _LATE,
-    integral: Integral = Integral.AFTER,
-) -> Law:
-    """Return the law of control_toolbox with one of its anti-windup strategies."""
-    strategy = name.removeprefix("control_toolbox_")
-    settings = (*_gains("p i d"), _strategy(strategy), *others)
-    return Law(name, _TOOLBOX, equation, limits, settings, integral, Slope.ERROR)
+    strategy: str, limits: str, *others: Setting, integral: Integral = Integral.AFTER
+) -> tuple[Law, Law]:
+    """Return the law of control_toolbox with an anti-windup strategy, and that with a velocity.
+
+    Controllers with a velocity state give it the error of the velocity. A driver that
+    differentiates its encoder, and a simulator that moves by the new velocity, have for velocity
+    the difference of the position.
+    """
+    equation = "I_k = I_{k-1} + i h e_k, then u_k = p e_k + I_k + d s_k"
+    if integral is Integral.AFTER:
+        equation = "u_k = p e_k + I_k + d s_k, then I_{k+1} = I_k + i h e_k"
+    plain = Law(
+        f"control_toolbox_{strategy}",
+        _TOOLBOX,
+        f"{equation}; s_k = (e_k - e_{{k-1}})/h",
+        limits,
+        (*_gains("p i d"), _strategy(strategy), *others),
+        integral,
+        Slope.ERROR,
+    )
+    return plain, replace(
+        plain,
+        name=f"{plain.name}_velocity",
+        program=f"{_TOOLBOX}, as {_CONTROLLERS} give it the velocity state of a joint",
+        equation=f"{equation}; s_k is minus the velocity, (y_{{k-1}} - y_k)/h",
+        slope=Slope.MEASUREMENT,
+    )
 
 
 _BACK_CALCULATION = _control_toolbox(
-    "control_toolbox_back_calculation",
+    "back_calculation",
     "the integral also gets h (u limited - u)/tracking_time_constant",
     # That which control_toolbox takes for 0; written out, since a program that runs keeps the one
     # of the gains before.
@@ -643,22 +659,18 @@ _ROWS = (
         bounds=lambda low, high: (("command_min", _or_none(low)), ("command_max", _or_none(high))),
         start=Start("initial_command is the present command.", "initial_command"),
     ),
-    _BACK_CALCULATION,
-    _control_toolbox(
-        "control_toolbox_conditional_integration", "no integration while u is limited and e u > 0"
-    ),
-    _control_toolbox("control_toolbox_none", "the integral winds up"),
-    _control_toolbox(
-        "control_toolbox_legacy",
+    *_BACK_CALCULATION,
+    *_control_toolbox("conditional_integration", "no integration while u is limited and e u > 0"),
+    *_control_toolbox("none", "the integral winds up"),
+    *_control_toolbox(
+        "legacy",
         "the integral stays between i_clamp_min and i_clamp_max",
-        equation=_EARLY,
         integral=Integral.BEFORE,
     ),
     replace(
-        _BACK_CALCULATION,
+        _BACK_CALCULATION[0],
         name="pid_controller",
-        program="pid_controller of ros2_controllers, 4.42.1 (branch jazzy), with one state "
-        f"interface; it runs {_TOOLBOX}",
+        program=f"pid_controller of {_CONTROLLERS} with one state interface; it runs {_TOOLBOX}",
     ),
     Law(
         "arduino_pid_v1",

@@ -69,7 +69,7 @@ class _Parts:
     :param keys: those in the parameter gains.
     :param commanded: what is commanded, such as ``effort``.
     :param measured: what is controlled, such as ``velocity``.
-    :param has_rate: True if the derivative comes from a second state interface.
+    :param has_rate: True if the derivative comes from the velocity of a second state interface.
     :param feeds: name of the parameter of the feed-forward; empty: there is none.
     :param unrolls: True if the errors of continuous joints are wrapped.
     :param kind: name of the message of the controller's state.
@@ -139,7 +139,7 @@ class JointLoop(_Parts):
     @property
     def law(self) -> str:
         """The law of control_toolbox, which all these controllers run, that the gains are for."""
-        return f"control_toolbox_{self.strategy}"
+        return f"control_toolbox_{self.strategy}{'_velocity' * self.has_rate}"
 
     @property
     def why_not_moved(self) -> str:

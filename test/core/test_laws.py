@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -27,13 +28,14 @@ WANTED = Controller(kc=1.3, ti=2.0, td=0.6, tf=0.7, b=0.4)
 PROCESS = TransferFunction.fopdt(0.9, 2.0, 0.8)
 
 
-def toolbox(s, h):
+def toolbox(s, h, has_velocity=False):
     """control_toolbox::Pid: u first, then the integral; legacy the other way round."""
     integral = last = 0.0
     while True:
         r, y = yield
         e = r - y
-        d, last = (e - last) / h, e
+        seen = -y if has_velocity else e
+        d, last = (seen - last) / h, seen
         if s["antiwindup_strategy"] == "legacy":
             integral += s["i"] * h * e
         u = s["p"] * e + integral + s["d"] * d
@@ -150,10 +152,11 @@ def our_own(s, h):
         yield law.step(r, y)
 
 
+STRATEGIES = ("none", "legacy", "back_calculation", "conditional_integration")
 SOURCES = {
     "controller_node": our_own,
-    **{f"control_toolbox_{s}": toolbox for s in ("none", "legacy", "back_calculation")},
-    "control_toolbox_conditional_integration": toolbox,
+    **{f"control_toolbox_{s}": toolbox for s in STRATEGIES},
+    **{f"control_toolbox_{s}_velocity": partial(toolbox, has_velocity=True) for s in STRATEGIES},
     "pid_controller": toolbox,
     "arduino_pid_v1": sum_and_clamp(("Kp", "Ki", "Kd")),
     "simple_pid": sum_and_clamp(("Kp", "Ki", "Kd")),

@@ -19,6 +19,7 @@ from parameter_values import check_parameter_file, check_value
 
 from relay_autotune.exchange.models import document
 from relay_autotune.identification.methods import METHODS
+from relay_autotune.loop.laws import LAWS
 from relay_autotune.nodes.plant import MODES
 from relay_autotune.process.structures import STRUCTURES
 from relay_autotune.recordings import read_experiments
@@ -59,7 +60,8 @@ def code_text() -> str:
 
 
 CODE = code_text()
-WORDS = frozenset(re.findall(r"\w+", CODE))
+# The names of laws are put together in the code.
+WORDS = frozenset((*re.findall(r"\w+", CODE), *LAWS))
 
 
 @pytest.mark.parametrize("page", GUIDE, ids=lambda p: str(p.relative_to(ROOT)))

@@ -19,6 +19,7 @@ from toolbox_pid import ToolboxPid
 from relay_autotune.cli import joint_tune
 from relay_autotune.cli.joint_tune import JointLoop
 from relay_autotune.cli.settings import Answers
+from relay_autotune.control.verification import Step, compare
 from relay_autotune.errors import LoopError
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.loop import laws
@@ -47,6 +48,7 @@ from relay_autotune.nodes.joint_loop import (
     limits_in,
 )
 from relay_autotune.nodes.loop_client import GoneError
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code
 from relay_autotune_msgs.action import Tune
 
@@ -135,13 +137,37 @@ def test_joints_that_would_go_limp_have_to_be_written_too() -> None:
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
-def test_gains_are_designed_for_the_law_of_the_strategy(strategy: str) -> None:
+@pytest.mark.parametrize("velocity", ["", "_velocity"])
+def test_gains_are_designed_for_the_law_of_the_strategy(strategy: str, velocity: str) -> None:
     period, gains = 0.01, Controller(0.8, 0.4, 0.05)
-    running = laws.LAWS[f"control_toolbox_{strategy}"].at(gains, period).running()
+    running = laws.LAWS[f"control_toolbox_{strategy}{velocity}"].at(gains, period).running()
     law = ToolboxPid(gains.p, gains.i, gains.d, strategy)
     measured = np.random.default_rng(3).normal(size=200)
+    rates = -np.diff(measured, prepend=0.0) / period if velocity else [None] * 200
     ours = [running.step(1.0, y) for y in measured]
-    assert ours == pytest.approx([law.step(1.0 - y, period) for y in measured], rel=1e-9)
+    theirs = [law.step(1.0 - y, period, d) for y, d in zip(measured, rates, strict=True)]
+    assert ours == pytest.approx(theirs, rel=1e-9)
+
+
+def test_a_step_of_a_joint_with_a_velocity_state_is_predicted_as_it_is_made() -> None:
+    """The velocity of the joint itself, which its difference lags by half a period."""
+    period, lag, gains = 0.01, 0.3, Controller(6.448, 1.169, 0.1623)
+    pid = ToolboxPid(gains.p, gains.i, gains.d, "none")
+    seen, velocity, position, on_the_way = list[float](), 0.0, 0.0, [0.0] * 3
+    for _ in range(300):
+        seen.append(position)
+        on_the_way.append(pid.step(1.0 - position, period, -velocity))
+        held, left = on_the_way.pop(0), math.exp(-period / lag)
+        position += held * period + (velocity - held) * lag * (1.0 - left)
+        velocity = held + (velocity - held) * left
+    arm = Arm()
+    rate = laws.LawRate(laws.LAWS[joint_loop(arm, arm, "arm", "arm_2").law], period)
+    model = TransferFunction(1.0, (), (lag,), dead_time=0.03, integrators=1)
+    control = in_another_node(gains, rate, 0.0)
+    found = compare(control, model, Step(setpoint=1.0), period * np.arange(300), np.array(seen))
+    assert found.passed, found.reason
+    assert found.expected.overshoot == pytest.approx(found.measured.overshoot, abs=0.01)
+    assert found.gain_ratio == pytest.approx(1.0, abs=0.03)
 
 
 def test_the_strategies_differ_at_a_limit_of_the_command() -> None:
@@ -388,7 +414,7 @@ def test_a_trajectory_controller_tells_joints_gains_state_and_law() -> None:
     assert (loop.interface, loop.measured, loop.period) == ("arm_2/effort", "position", 0.01)
     assert loop.places == {name: f"gains.arm_2.{name}" for name in "pid"}
     assert (loop.gains, loop.feedforward) == ((5.0, 1.0, 0.5), 0.7)
-    assert (loop.law, loop.has_rate, loop.wraps) == ("control_toolbox_none", True, True)
+    assert (loop.law, loop.wraps) == ("control_toolbox_none_velocity", True)
     # By the names of the message, whatever their order.
     assert loop.state == DofState(0.2, pytest.approx(0.25), pytest.approx(3.0))
     assert loop.why_not_moved == "its references are trajectories"

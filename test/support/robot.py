@@ -220,7 +220,7 @@ class ToolboxController(Controller):
 
 
 class PidController(ToolboxController):
-    """pid_controller with one state interface."""
+    """pid_controller, of a position with the velocity as its second state interface."""
 
     type_name = "pid_controller/PidController"
 
@@ -231,10 +231,12 @@ class PidController(ToolboxController):
         declare("dof_names", list(self.joints))
         declare("reference_and_state_dof_names", list(self.joints))
         declare("command_interface", "effort")
-        declare("reference_and_state_interfaces", [kind.measured])
+        self.interfaces = ["position", "velocity"] if kind.measured == "position" else ["velocity"]
+        declare("reference_and_state_interfaces", self.interfaces)
         declare("enable_feedforward", False)
         self.references = tuple(f"{self.name}/{joint}/{kind.measured}" for joint in self.joints)
         self.reference = list(kind.joints.values())
+        self.speeds = [math.nan for _ in self.joints]
         for law, (joint, value) in zip(self.laws, kind.joints.items(), strict=True):
             law.integral = kind.joint(value).effort - self.fed(joint, value)
         self.told: MultiDOFCommand | None = None
@@ -255,6 +257,7 @@ class PidController(ToolboxController):
     def activate(self, measured: dict[str, float]) -> None:
         self.told = None
         self.reference = [measured[joint] for joint in self.joints]
+        self.speeds = [math.nan for _ in self.joints]
         for k, joint in enumerate(self.joints):
             kept = self.node.get_parameter(f"gains.{joint}.save_i_term").value
             self.laws[k].reset(save_integral=kept)
@@ -266,11 +269,17 @@ class PidController(ToolboxController):
             for k, value in enumerate(self.told.values):
                 if not math.isnan(value):
                     self.reference[k] = value
+                    if not math.isnan(self.told.values_dot[k]):
+                        self.speeds[k] = self.told.values_dot[k]
         self.told = None
         state = MultiDOFStateStamped()
         for k, joint in enumerate(self.joints):
             error = self.reference[k] - measured[joint]
-            output = self.laws[k].step(error, PERIOD) + self.fed(joint, self.reference[k])
+            # Without a reference of the velocity the derivative is the difference of the error.
+            rate = self.speeds[k] - measured[f"{joint}/velocity"]
+            has_rate = len(self.interfaces) > 1 and not math.isnan(rate)
+            output = self.laws[k].step(error, PERIOD, rate if has_rate else None)
+            output += self.fed(joint, self.reference[k])
             commands[f"{joint}/effort"] = output
             state.dof_states.append(
                 SingleDOFState(
