@@ -9,7 +9,7 @@ import argparse
 import json
 import math
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
@@ -21,14 +21,13 @@ from relay_autotune.cli.loops import Loop, Steps, WhyOver
 from relay_autotune.cli.own_nodes import (
     PROGRAM,
     START_WITHIN,
-    OwnNodes,
     namespace_of_joint,
     own_namespace,
     own_node,
     ranges,
     ros_arguments,
 )
-from relay_autotune.cli.settings import Answers
+from relay_autotune.cli.settings import Question
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import Working, agrees, tell, width
 from relay_autotune.errors import LoopError, SelectionError
@@ -47,6 +46,7 @@ from relay_autotune.nodes.joint_loop import COMMAND_TYPE, STATE_TYPE, joint_loop
 from relay_autotune.nodes.live_types import CommandMessage, message_class
 from relay_autotune.nodes.loop_client import GoneError, LoopClient
 from relay_autotune.nodes.readiness import ChecklistLine, Mark
+from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune_msgs.action import Tune
 
 _JOINT_STATES = "joint_states"
@@ -63,14 +63,19 @@ class JointLoop(Loop):
 
     :param robot: a node of the graph; it goes on where a node of this command is lost.
     :param options: of the command line; the namespace of the nodes is set in it.
+    :param client: returns the client of the relay_node that will be started in a namespace.
     :raises LoopError: if the loop is not there, or something is not known and nobody can be asked.
     """
 
     has_own_nodes = True
 
-    def __init__(self, robot: LoopClient, options: argparse.Namespace) -> None:
-        self._client, self.options = robot, options
-        self.answers, self.nodes = Answers(options), OwnNodes()
+    def __init__(
+        self,
+        robot: LoopClient,
+        options: argparse.Namespace,
+        client: Callable[[str, LoopClient], TuneClient],
+    ) -> None:
+        self._robot = robot
         self._forward: ManagedController | None = None
         self._former: tuple[str, ...] = ()
         with Working(f"looking at {options.controller}"):
@@ -79,15 +84,15 @@ class JointLoop(Loop):
             self._manager = ControllerManager(
                 robot, options.controller_manager or "", within, options.wait
             )
-            self._loop = joint_loop(robot, self._manager, controller, options.joint)
+            self._loop = loop = joint_loop(robot, self._manager, controller, options.joint)
+            self.options = options
             if options.open:
                 loaded = self._manager.controllers()
                 self._forward = forwarding(
-                    loaded, self._loop.interface, options.forward or "", self._limp
+                    loaded, loop.interface, options.forward or "", self._limp
                 )
                 self._former = in_the_way(loaded, self._forward.needs)
                 self._held = self._commands_beside(self._forward)
-        loop = self._loop
         options.namespace = namespace_of_joint(loop.node, loop.joint)
         self._space = own_namespace(options)
         if loop.why_not_moved and not options.open:
@@ -97,20 +102,42 @@ class JointLoop(Loop):
                 f"{loop.controller} has no reference for {loop.joint} yet: publish one on "
                 f"{loop.reference_topic}, and wait until the joint rests there"
             )
-        answers = self.answers
-        if options.within is None and loop.within is not None:
+        super().__init__(client(self._space, robot), options)
+        self.client.left_behind = self.left_behind
+        self._take_known()
+        if not options.web:
+            self.answers.ask(*self._questions())
+
+    def _take_known(self) -> None:
+        """Take what the robot tells of the settings that are not given."""
+        loop, answers = self._loop, self.answers
+        if answers["within"] is None and loop.within is not None:
             answers.take({"within": loop.within}, "robot_description")
-        else:
-            answers.measured = loop.state.feedback
-            what = f"lowest and highest {loop.measured} that {loop.joint} may have"
-            answers.ask("within", what, "-5 5")
-        self._baseline = loop.state.output if options.at is None else options.at
-        if options.open:
-            if not math.isfinite(self._baseline):
-                what = f"present {loop.commanded} of {loop.joint}, at which it rests"
-                answers.ask("at", what, "0")
-                self._baseline = options.at
-            self._know_range()
+        answers.measured = loop.state.feedback
+        if not self.options.open:
+            self.form = ("within", "amplitude")
+            return
+        if answers["at"] is None and math.isfinite(loop.state.output):
+            answers.take({"at": loop.state.output}, "its output")
+        told = [loop.clamps, loop.command_within or (-math.inf, math.inf)]
+        found = [max(low for low, _ in told), min(high for _, high in told)]
+        if answers["command_within"] is None and all(map(math.isfinite, found)):
+            answers.take({"command_within": found}, "its limits")
+
+    def _questions(self) -> list[Question]:
+        """Return what is asked for where it is not known."""
+        loop = self._loop
+        of = f"{loop.commanded} of {loop.joint}"
+        wanted = [
+            Question("within", f"lowest and highest {loop.measured} that {loop.joint} may have",
+                     "-5 5"),
+        ]  # fmt: skip
+        if self.options.open:
+            wanted.append(Question("at", f"present {of}, at which it rests", "0"))
+            # The amplitude is found by them.
+            if not self.options.amplitude:
+                wanted.append(Question("command_within", f"lowest and highest {of}", "-2 2"))
+        return wanted
 
     @property
     def title(self) -> str:
@@ -179,7 +206,7 @@ class JointLoop(Loop):
             "switches",
             f"{off} off and {self._forward.name} on, in one strict request; back after it",
         )
-        yield "moves", f"the {loop.commanded} of {loop.joint} itself, about {self._baseline:.6g}"
+        yield "moves", f"the {loop.commanded} of {loop.joint} itself, about {self.options.at:.6g}"
         yield "within", f"{limits}, for {loop.measured}"
         beside = [
             f"{name} {value:.6g}"
@@ -275,8 +302,7 @@ class JointLoop(Loop):
         """Return the arguments for ROS of the nodes that tune it."""
         loop, options = self._loop, self.options
         topics, values = self._opened_ends() if options.open else self._closed_ends()
-        values["amplitude"] = options.amplitude
-        values |= self.answers.parameters(["measurement_timeout"])
+        values |= self.parameters((*self.form, "measurement_timeout"))
         nodes = {"relay_node": ros_arguments(self._space, topics, values)}
         if not options.record_only:
             design = {"law": loop.law, "sample_period": loop.period}
@@ -289,9 +315,15 @@ class JointLoop(Loop):
         return topics, values | {
             "relay_on": "setpoint",
             "setpoint": self._loop.state.reference,
-            # The levels are references, which have the limits of the measurement.
-            **ranges(None, self.options.within),
         }
+
+    def parameters(self, names: Collection[str]) -> dict[str, Any]:
+        """Return the parameters of relay_node that some settings set, as far as they are known."""
+        found = super().parameters(names)
+        if self._forward is None and "within" in names:
+            # The levels are references, which have the limits of the measurement.
+            found |= ranges(None, self.options.within)
+        return found
 
     def _at_controller(self) -> tuple[dict[str, str], dict[str, Any]]:
         """Return topics and parameters of a node that hears the controller and moves it."""
@@ -308,7 +340,7 @@ class JointLoop(Loop):
 
     def _opened_ends(self) -> tuple[dict[str, str], dict[str, Any]]:
         assert self._forward is not None
-        loop, options, client = self._loop, self.options, self._client
+        loop, options, client = self._loop, self.options, self._robot
         kind, field = _JOINT_STATE, f"{loop.measured}[{loop.joint}]"
         topic = options.measurement or self._manager.node_of(_JOINT_STATES)
         found = client.kind_of(topic, options.wait, published=True)
@@ -326,25 +358,12 @@ class JointLoop(Loop):
             "command_type": _FLOATS,
             "command_field": f"data[{place}]",
             "command_message": json.dumps(f"{{data: {held}}}"),
-            "baseline": self._baseline,
-            **ranges(self.options.within, self.options.command_within),
             "use_sim_time": loop.is_simulated,
         }
         if loop.measured == "position" and loop.commanded != "position":
             # It drifts at a constant command, but its controllers come back at once.
             values |= {"process_type": "integrating", "start_without_hold": True}
         return topics, values
-
-    def _know_range(self) -> None:
-        """Take the limits of the command, asked for where the amplitude is found by them."""
-        loop, options = self._loop, self.options
-        told = [loop.clamps, loop.command_within or (-math.inf, math.inf)]
-        found = [max(low for low, _ in told), min(high for _, high in told)]
-        if options.command_within is None and all(map(math.isfinite, found)):
-            options.command_within = found
-        elif not options.amplitude:
-            what = f"lowest and highest {loop.commanded} of {loop.joint}"
-            self.answers.ask("command_within", what, "-2 2")
 
     def _commands_beside(self, forward: ManagedController) -> list[float]:
         """Return what each interface of the forwarding controller is told; NaN: the joint."""
@@ -385,7 +404,7 @@ class JointLoop(Loop):
 
     def _position_of(self, joint: str) -> float:
         kind = message_class(_JOINT_STATE, "measurement_type")
-        for message in self._client.heard(kind, self._manager.node_of(_JOINT_STATES), 0.0, 1):
+        for message in self._robot.heard(kind, self._manager.node_of(_JOINT_STATES), 0.0, 1):
             if joint in message.name:
                 return float(message.position[list(message.name).index(joint)])
         return math.nan
@@ -398,7 +417,7 @@ class JointLoop(Loop):
         with ExitStack() as stack:
             if forward is not None:
                 # Controllers that command 0 when they are switched off leave it to the next one.
-                with self._client.publishing(*self._first_command()) as command:
+                with self._robot.publishing(*self._first_command()) as command:
                     give_back = self._give_references_back
                     stack.enter_context(
                         opened(self._manager, forward.name, self._former, give_back)
@@ -427,7 +446,7 @@ class JointLoop(Loop):
         topics, values = self._opened_ends()
         beside = json.loads(values["command_message"])
         message = CommandMessage(values["command_type"], values["command_field"], beside)
-        return message.written(self._baseline), topics["command"]
+        return message.written(self.options.at), topics["command"]
 
     @property
     def left_behind(self) -> str:
@@ -464,7 +483,7 @@ class JointLoop(Loop):
             told = {dof.name: dof.reference for dof in message.dof_states}
             return bool(told.get(loop.joint) == reference)
 
-        if math.isfinite(reference) and not self._client.publish(
+        if math.isfinite(reference) and not self._robot.publish(
             commands.written(reference), loop.reference_topic, states, loop.state_topic, is_back
         ):
             say(
@@ -509,7 +528,7 @@ class JointLoop(Loop):
 
         :raises LoopError: if it does not answer.
         """
-        return gains_at(self._client, self._loop.node, self._loop.places)
+        return gains_at(self._robot, self._loop.node, self._loop.places)
 
     def first(self) -> Steps:
         """Return how to activate its controller before another tune, if it is not active."""
@@ -534,19 +553,7 @@ class JointLoop(Loop):
         loop = self._loop
         if loop.why_not_moved:
             return self._set(), ""
-        places = ",".join(map("{}:{}".format, *zip(*loop.places.items(), strict=True)))
-        topics, values = self._at_controller()
-        values |= {
-            "apply_to": loop.node,
-            "apply_parameters": places,
-            "apply_feedforward": loop.feedforward,
-            "initial_setpoint": loop.state.reference,
-        }
-        for name, clamp in zip(("command_min", "command_max"), loop.clamps, strict=True):
-            if math.isfinite(clamp):
-                values[name] = clamp
-        # Not before, since relay_node refuses a second publisher of the reference.
-        self.nodes.start("controller_node", ros_arguments(self._space, topics, values))
+        self._start_controller()
         why_inactive = self._manager.still_active(loop.controller)
         self.client.why_lost = lambda: self.nodes.why_lost() or why_inactive()
         try:
@@ -562,9 +569,38 @@ class JointLoop(Loop):
             self.nodes.end("controller_node")
             raise GoneError(f"{error}; {self._put_back()}") from error
 
+    def _start_controller(self) -> None:
+        """Start a controller_node that puts gains into the joint's controller and verifies them.
+
+        Not before a tune: relay_node refuses a second publisher of the reference.
+        """
+        loop = self._loop
+        places = ",".join(map("{}:{}".format, *zip(*loop.places.items(), strict=True)))
+        topics, values = self._at_controller()
+        values |= {
+            "apply_to": loop.node,
+            "apply_parameters": places,
+            "apply_feedforward": loop.feedforward,
+            "initial_setpoint": loop.state.reference,
+        }
+        for name, clamp in zip(("command_min", "command_max"), loop.clamps, strict=True):
+            if math.isfinite(clamp):
+                values[name] = clamp
+        self.nodes.start("controller_node", ros_arguments(self._space, topics, values))
+
+    def after_tune(self) -> None:
+        """Let a page show, change and verify the gains of the joint's controller."""
+        if not (self.options.keep_gains or self._loop.why_not_moved):
+            self._start_controller()
+
+    def before_tune(self) -> None:
+        """End that: relay_node has to be the only one that publishes the reference."""
+        self.nodes.end("controller_node")
+        self.client.wait(lambda: not self.client.controllers(), _PATIENCE)
+
     def _set(self) -> bool:
         """Set the gains of a controller whose references nobody can move; return whether."""
-        loop, client = self._loop, self._client
+        loop, client = self._loop, self._robot
         found = self.client.result
         gains = gains_from_message(found.gains)
         model = transfer_function_from_message(found.transfer_function)

@@ -13,7 +13,7 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from itertools import zip_longest
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.bag.field_path import first_numbers, unit_of_field
 from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, ros_arguments
-from relay_autotune.cli.settings import FLAGS, SETTING, Answers, as_flags
+from relay_autotune.cli.settings import FLAGS, SETTING, Answers, Question, as_flags
 from relay_autotune.cli.terminal import UNITS, Working, asked, broken, width
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
 from relay_autotune.exchange.export import Target
@@ -77,14 +77,20 @@ class Loop:
         if unknown := set(changed) - set(self.form):
             raise SelectionError(f"{', '.join(sorted(unknown))} is no setting of {self.title}")
         self.answers.take(changed)
-        self.client.set_values(self.client.name, self.answers.parameters(changed))
+        self.client.set_values(self.client.name, self.parameters(changed))
 
     def lacking(self) -> list[str]:
         """Return the questions that must be answered before a tune."""
-        return []
+        return self.answers.lacking(self.form) if self.has_own_nodes else []
+
+    def parameters(self, names: Collection[str]) -> dict[str, Any]:
+        """Return the parameters of relay_node that some settings set, as far as they are known."""
+        return self.answers.parameters(names)
 
     def look(self) -> None:
-        """Take the settings that relay_node has now."""
+        """Take the settings that relay_node has now; nobody else changes one of this command."""
+        if self.has_own_nodes:
+            return
         names = list(self.answers.parameters_of(self.form))
         with suppress(LoopError):
             self.answers.read(self.client.values(self.client.name, names, _ANSWERS))
@@ -95,13 +101,26 @@ class Loop:
         :raises LoopError: if it refuses them, or somebody else commands.
         """
         options = self.options
+        if self.has_own_nodes:
+            return
         # An amplitude is that of one tune, unless a page can start more.
         names = [name for name in self.form if name != "amplitude" or options.web]
         given = [n for n in (*names, "measurement_timeout") if SETTING[n].is_given(options)]
         if given:
-            self.client.set_values(self.client.name, self.answers.parameters(given))
+            self.client.set_values(self.client.name, self.parameters(given))
         if options.web:
             self.look()
+
+    def ask_again(self) -> None:
+        """Ask for the last answer again, and tell relay_node."""
+        changed = self.answers.ask_again()
+        self.client.set_values(self.client.name, self.parameters(changed))
+
+    def before_tune(self) -> None:
+        """End what proves gains on a page."""
+
+    def after_tune(self) -> None:
+        """Start what proves gains on a page."""
 
     def plan(self) -> list[str]:
         """Return what the loop itself has to say of a tune, as lines of a checklist."""
@@ -221,16 +240,10 @@ class TopicLoop(Loop):
         with Working(f"looking who commands {command}"):
             self._require_alone()
         self._give_up = client.claim(self._commands.kind, command)
-        needed = [name for name in self.form[:3] if answers[name] is None]
-        if options.web:
-            return
-        if sys.stdin.isatty() and needed and len(UNITS) < 2:
-            print("u is the command's unit, y the measurement's", file=sys.stderr)
-        # What is given and cannot be is refused before anything is asked for.
-        for name in sorted(self.form[:3], key=needed.count):
+        if not options.web:
             # The amplitude is found between the limits of the command.
-            if name != "command_within" or name not in needed or not options.amplitude:
-                answers.ask(name)
+            known = options.amplitude and options.command_within is None
+            answers.ask(*map(Question, self.form[: 2 if known else 3]))
 
     def _choose_field(self) -> None:
         """Ask for the number that measures where the messages do not have the one of --field.
@@ -261,13 +274,6 @@ class TopicLoop(Loop):
     def title(self) -> str:
         """The name of the loop for people."""
         return f"{self.options.measurement} -> {self.options.command}"
-
-    def lacking(self) -> list[str]:
-        """Return the questions that must be answered before a tune."""
-        return self.answers.lacking(self.form)
-
-    def look(self) -> None:
-        """Leave the settings as they are: nobody else knows its relay_node."""
 
     def joined(self) -> None:
         """Leave the command to relay_node alone, which has the settings since its start.

@@ -12,13 +12,14 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
 from relay_autotune.cli.arguments import finite, flag_of
-from relay_autotune.cli.terminal import UNITS, asked, number_of, pair_of
+from relay_autotune.cli.terminal import BACK, UNITS, GoBack, asked, number_of, pair_of
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import Quantity
@@ -206,6 +207,20 @@ def as_flags(text: str) -> str:
     return text
 
 
+@dataclass(frozen=True)
+class Question:
+    """What is asked for.
+
+    :param name: of the setting.
+    :param what: how it is asked for; empty: as its row says.
+    :param example: what may be typed; empty: as its row says.
+    """
+
+    name: str
+    what: str = ""
+    example: str = ""
+
+
 @dataclass
 class Answers:
     """What is known of a loop, where it comes from, and what is asked for.
@@ -217,6 +232,7 @@ class Answers:
     options: argparse.Namespace
     measured: float = math.nan
     _from: dict[str, str] = field(default_factory=dict)
+    _asked: list[Question] = field(default_factory=list)
 
     def __getitem__(self, name: str) -> Any:
         """Return the value of a setting; None: it is not known."""
@@ -294,22 +310,52 @@ class Answers:
             if len(found) == each.ends and all(map(math.isfinite, found)):
                 setattr(self.options, each.name, found if each.ends > 1 else found[0])
 
-    def ask(self, name: str, what: str = "", example: str = "") -> None:
-        """Ask for a value that is not known yet, and refuse one that cannot be.
+    def ask(self, *questions: Question) -> None:
+        """Ask for what is not known yet, and refuse what cannot be; `<` goes back to the last one.
 
-        :param name: of the setting.
-        :param what: how it is asked for; empty: as its row says.
-        :param example: what may be typed; empty: as its row says.
+        What is given is looked at before anything is asked for.
+
+        :param questions: in their order.
+        :raises SelectionError: if what is given cannot be.
+        :raises LoopError: if nobody can be asked.
         """
-        setting = SETTING[name]
-        if self[name] is not None:
-            self.take({name: self[name]}, self.source(name))
-            return
-        seen = self.now(name)
+        for each in questions:
+            if (given := self[each.name]) is not None:
+                self.take({each.name: given}, self.source(each.name))
+        self._asked = [each for each in questions if self[each.name] is None]
+        told = ["u is the command's unit, y the measurement's"] * (len(UNITS) < 2)
+        told += [f"{BACK} at a question goes back to the one before"] * (len(self._asked) > 1)
+        if sys.stdin.isatty() and self._asked and told:
+            print("; ".join(told), file=sys.stderr)
+        self._ask_from(0)
+
+    def ask_again(self) -> list[str]:
+        """Ask for the last answer again, and return the names of the settings that were asked."""
+        self._ask_from(len(self._asked) - 1)
+        return [each.name for each in self._asked]
+
+    @property
+    def may_go_back(self) -> bool:
+        """Whether something was asked for."""
+        return bool(self._asked)
+
+    def _ask_from(self, place: int) -> None:
+        while place < len(self._asked):
+            each = self._asked[place]
+            # Neither it nor what comes after it speaks against another value.
+            for later in self._asked[place:]:
+                setattr(self.options, later.name, None)
+            try:
+                self._ask(each, back=place > 0)
+                place += 1
+            except GoBack:
+                place -= 1
+
+    def _ask(self, question: Question, *, back: bool) -> None:
+        name, example = question.name, question.example
+        setting, seen = SETTING[name], self.now(name)
         if setting.ends > 1 and seen:
             example = "{:g} {:g}".format(*_around(self._seen(name)))
-        example = example or setting.example
-        question = f"{what or setting.question} [{SETTING[name].unit}]" + f", {seen}" * bool(seen)
 
         def read(text: str) -> Any:
             if (unit := unit_of(text)) and setting.read(text) is not None:
@@ -317,8 +363,9 @@ class Answers:
             return setting.read(text)
 
         value = asked(
-            question, flag_of(setting), "", example, read,
-            lambda found: self.why_impossible(name, found), pair=setting.ends > 1,
+            f"{question.what or setting.question} [{setting.unit}]" + f", {seen}" * bool(seen),
+            flag_of(setting), "", example or setting.example, read,
+            lambda found: self.why_impossible(name, found), pair=setting.ends > 1, back=back,
         )  # fmt: skip
         self.take({name: value}, "typed")
 
@@ -438,7 +485,8 @@ def _require_joint(options: argparse.Namespace) -> None:
             f"name the robot's controller by --controller "
             f"/{options.namespace.strip('/')}/{controller}"
         )
-    if options.web or (options.json and not (options.keep_gains or options.dry_run)):
+    if options.json and not (options.keep_gains or options.dry_run):
         raise SelectionError(
-            "a joint is tuned in the terminal: leave out --web, and --json without --keep-gains"
+            "the gains of a joint are applied after a question: leave out --json, or give "
+            "--keep-gains"
         )

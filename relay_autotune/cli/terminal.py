@@ -380,18 +380,31 @@ def asked_for_file(what: str, names: Collection[str]) -> str:
         print("\n".join(broken(told, width())), file=sys.stderr)
 
 
-def agrees(question: str, *, yes: bool) -> bool:
+# What goes back to the question before.
+BACK = "<"
+
+
+class GoBack(Exception):  # noqa: N818  it is no error
+    """Somebody wishes to change the last answer."""
+
+
+def agrees(question: str, *, yes: bool, back: bool = False) -> bool:
     """Ask a question, unless ``--yes`` has answered it.
 
     :param question: with its question mark.
     :param yes: whether the flag was given.
+    :param back: whether there is a question before.
     :raises LoopError: if nobody can be asked.
+    :raises GoBack: if that is to be asked again.
     """
     if yes:
         return True
     _require_somebody("--yes")
     _forget_typed()
-    return _input(f"\n{question} [y/N] ").lower() in ("y", "yes")
+    answer = _input(f"\n{question} [y/N] ").lower()
+    if back and answer == BACK:
+        raise GoBack
+    return answer in ("y", "yes")
 
 
 def end_with_terminal() -> None:
@@ -473,6 +486,7 @@ def asked(
     why_impossible: Callable[[Any], str] = lambda _: "",
     *,
     pair: bool = False,
+    back: bool = False,
 ) -> Any:
     """Ask for a value until it can be read and can be.
 
@@ -483,6 +497,8 @@ def asked(
     :param read: returns the value of a text; None: it has none.
     :param why_impossible: tells why a value cannot be; empty: it can.
     :param pair: whether two numbers are asked for.
+    :param back: whether there is a question before.
+    :raises GoBack: if that is to be asked again.
     """
     _require_somebody(flag)
     shown = (
@@ -491,7 +507,10 @@ def asked(
         + ": " * (not known)
     )
     while True:
-        value = read(_input(shown) or known)
+        text = _input(shown) or known
+        if back and text == BACK:
+            raise GoBack
+        value = read(text)
         if value is None:
             found = "two numbers, the lower one first" if pair else "a number"
             said = f"expected {found}, such as {example}"

@@ -36,7 +36,7 @@ from relay_autotune.cli.arguments import (
 from relay_autotune.cli.flow import checked, run
 from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN, own_namespace
 from relay_autotune.cli.settings import FLAGS, Kind, add_settings, kind_of
-from relay_autotune.cli.terminal import Help, Working, agrees, require_new, width
+from relay_autotune.cli.terminal import GoBack, Help, Working, agrees, require_new, width
 from relay_autotune.cli.tune_view import Shown, check_lines
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
@@ -233,8 +233,9 @@ class Session:
         ready_within = max(self._options.wait, _READY_WITHIN)
         deadline = time.monotonic() + min(patience, ready_within)
         loop = loops[0]
-        print("".join(f"{line}\n" for line in check_lines(loop.plan(), width())), end="",
-              file=sys.stderr, flush=True)  # fmt: skip
+        if not options.web:
+            print("".join(f"{line}\n" for line in check_lines(loop.plan(), width())), end="",
+                  file=sys.stderr, flush=True)  # fmt: skip
         asks = loop.has_own_nodes and not (options.dry_run or options.web)
         if asks and not self._is_agreed(loop, deadline):
             return NOTHING_FOUND
@@ -289,10 +290,7 @@ class Session:
             from relay_autotune.cli.joint_tune import JointLoop
 
             robot = self._joined(LoopClient, own_namespace(options), "", options.node, ros)
-            joint = JointLoop(robot, options)
-            joint.client = client(own_namespace(options), robot)
-            joint.client.left_behind = joint.left_behind
-            return [joint]
+            return [JointLoop(robot, options, client)]
         spaces = options.namespace.split(",") if options.web else [options.namespace]
         # The loops of a page have settings of their own.
         return [Loop(client(space), argparse.Namespace(**vars(options))) for space in spaces]
@@ -323,14 +321,20 @@ class Session:
 
     def _is_agreed(self, loop: Loop, deadline: float) -> bool:
         """Show the plan of a tune, and return whether it is to start."""
-        options, client = self._options, loop.client
-        with Working("looking at the loop"):
-            found = checked(loop, deadline)
-        print("\n".join(check_lines(loop.checklist(found), width())), flush=True, file=sys.stderr)
-        if not client.succeeded:
-            say(PROGRAM, f"{loop.title} refuses: {client.result.reason}")
-            return False
-        return agrees("Start the tune?", yes=options.yes)
+        client = loop.client
+        while True:
+            with Working("looking at the loop"):
+                found = checked(loop, deadline)
+            lines = check_lines(loop.checklist(found), width())
+            print("\n".join(lines), flush=True, file=sys.stderr)
+            if not client.succeeded:
+                say(PROGRAM, f"{loop.title} refuses: {client.result.reason}")
+                return False
+            may_go_back = loop.answers.may_go_back
+            try:
+                return agrees("Start the tune?", yes=self._options.yes, back=may_go_back)
+            except GoBack:
+                loop.ask_again()
 
     def _tune(self, loop: Loop, deadline: float) -> None:
         """Ask for the tune, and show it until its result is there."""

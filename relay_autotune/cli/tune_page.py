@@ -132,6 +132,8 @@ class _LoopOnPage:
         self._ends: list[int] = []
         self._heeded = 0
         self._at_first: Callable[[], object] | None = None
+        # What the loop itself says of the next tune.
+        self._plan: list[str] = []
 
     def run(self, interrupted: list[int]) -> int:
         """Do what is wished on the page, until a signal comes.
@@ -211,6 +213,8 @@ class _LoopOnPage:
         try:
             if wish.settings:
                 self._loop.set(dict(wish.settings))
+            self._loop.before_tune()
+            self._plan = [] if self._loop.lacking() else self._loop.plan()
         except RelayAutotuneError as error:
             checked = live.told.checked + 1
             live.rest(str(error), good=False, checks=(), checked=checked, accepted=False)
@@ -234,7 +238,7 @@ class _LoopOnPage:
         self._live.rest(
             "a tune can start" if accepted else f"refused: {result.reason}",
             good=accepted,
-            checks=tuple(map(check_parts, self._loop.checklist(result))),
+            checks=tuple(map(check_parts, [*self._plan, *self._loop.checklist(result)])),
             checked=self._live.told.checked + 1,
             accepted=accepted,
             limits=tuple(self._options.within or ()),
@@ -279,6 +283,8 @@ class _LoopOnPage:
             live.tell(process=self._show(result.transfer_function, cycles))
             self._add_subject(tune)
         done = client.succeeded and tune.has_gains
+        if tune.has_gains:
+            self._loop.after_tune()
         self._gains.look_after_tune(tune)
         live.forget_wishes()
         if tune.left:

@@ -34,6 +34,7 @@ from relay_autotune.cli.loops import Loop, TopicLoop
 from relay_autotune.cli.own_nodes import OwnNodes, namespace_of_joint, ros_arguments
 from relay_autotune.cli.settings import Kind, kind_of
 from relay_autotune.cli.terminal import (
+    GoBack,
     agreed_step,
     agrees,
     asked_for_file,
@@ -300,6 +301,16 @@ def test_the_robot_of_a_joint_is_named_with_its_controller() -> None:
         kind_of(tune_loop._parser().parse_args(words))
 
 
+def test_a_joint_is_tuned_on_a_page_too() -> None:
+    words = ["--controller", "wheel_pid", "--joint", "left"]
+    assert kind_of(tune_loop._parser().parse_args([*words, "--web"])) is Kind.JOINT
+    assert kind_of(tune_loop._parser().parse_args([*words, "--open", "--at", "1"])) is Kind.OPENED
+    with pytest.raises(SelectionError, match="--at is for --open: leave it out"):
+        kind_of(tune_loop._parser().parse_args([*words, "--at", "1"]))
+    with pytest.raises(SelectionError, match="leave out --json"):
+        kind_of(tune_loop._parser().parse_args([*words, "--json"]))
+
+
 def test_what_is_not_given_is_asked_for_until_it_can_be_read(typed: list[str]) -> None:
     typed += ["two", "2", "30", "30 50", "0, 5"]
     found = arguments(Looker(), options())
@@ -469,6 +480,34 @@ def test_a_question_shows_what_is_now_and_refuses_what_cannot_be(
     assert "the present command is 2: give limits around it" in said
 
 
+def test_an_answer_that_was_mistyped_is_changed_at_the_next_question(
+    typed: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    # The first question has none before it. Limits of the command need the present one.
+    typed += ["<", "20", "30 50", "<", "<", "2", "30 60", "0 5"]
+    client: Any = Looker(measures=44.0)
+    client.name, sent = "/tank/relay_node", {}
+    client.set_values = lambda node, values: sent.update(values)
+    loop = TopicLoop(client, options())
+    assert not typed
+    given = loop.options
+    assert (given.at, given.within, given.command_within) == (2.0, [30.0, 60.0], [0.0, 5.0])
+    assert "< at a question goes back to the one before" in capsys.readouterr().err
+    # Also at the last one, which shows the plan: then relay_node runs.
+    typed += ["<"]
+    with pytest.raises(GoBack):
+        agrees("Start the tune?", yes=False, back=loop.answers.may_go_back)
+    typed += ["<", "30 50", "1 6"]
+    loop.ask_again()
+    assert not typed
+    assert sent == {
+        "baseline": 2.0, "safe_command": 2.0, "measurement_min": 30.0, "measurement_max": 50.0,
+        "command_min": 1.0, "command_max": 6.0,
+    }  # fmt: skip
+    typed += ["<"]
+    assert not agrees("Start the tune?", yes=False)
+
+
 def test_units_that_are_typed_or_that_messages_say_stand_everywhere(
     typed: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -533,6 +572,7 @@ def test_a_check_before_the_plan_is_filled_says_what_is_missing() -> None:
     live = Live("tank")
     shown: Any = _LoopOnPage.__new__(_LoopOnPage)
     shown._loop, shown._live, shown._client, shown._options = loop, live, client, loop.options
+    shown._plan = []
     shown._check()
     assert "present command" in live.told.status and "command of the actuator" in live.told.status
     assert "measurement" not in live.told.status and not live.told.accepted

@@ -18,6 +18,7 @@ from toolbox_pid import ToolboxPid
 
 from relay_autotune.cli import joint_tune
 from relay_autotune.cli.joint_tune import JointLoop
+from relay_autotune.cli.loops import Loop
 from relay_autotune.cli.settings import Answers
 from relay_autotune.control.verification import Step, compare
 from relay_autotune.errors import LoopError
@@ -289,7 +290,7 @@ def test_controllers_are_off_until_the_relay_ends_and_no_longer(is_open: bool) -
         _loop=SimpleNamespace(controller="pid"), _manager=manager, _former=("pid",),
         _forward=next(c for c in LOADED if c.name == "one") if is_open else None,
         _first_command=lambda: ("rest", "/one/commands"),
-        _client=SimpleNamespace(publishing=lambda *_: publishing),
+        _robot=SimpleNamespace(publishing=lambda *_: publishing),
         _give_references_back=lambda: given.append("references"),
         _put_back=lambda: given.append("references") or "the reference is back",
         nodes=SimpleNamespace(why_lost=lambda _: ""),
@@ -452,15 +453,16 @@ def test_an_opened_joint_without_limits_of_the_command_is_tuned_without_them() -
     loop = joint_loop(arm, arm, "arm", "arm_2")
     options = SimpleNamespace(
         open=True, amplitude=0.5, record_only=True, measurement=None, field="data", wait=0.0,
-        within=(-1.0, 2.0), command_within=None, measurement_timeout=5.0,
+        within=(-1.0, 2.0), command_within=None, measurement_timeout=5.0, at=0.0,
     )  # fmt: skip
     tune = SimpleNamespace(
         _loop=loop, options=options, answers=Answers(options), _manager=arm, _held=[math.nan],
-        _baseline=0.0,
-        _client=SimpleNamespace(kind_of=lambda *_, **__: ""), _space="tune",
+        _robot=SimpleNamespace(kind_of=lambda *_, **__: ""), _space="tune",
+        form=Loop.form,
         _forward=SimpleNamespace(name="forward", needs=(loop.interface,)),
     )  # fmt: skip
     tune._opened_ends = lambda: JointLoop._opened_ends(tune)
+    tune.parameters = tune.answers.parameters
     words = JointLoop.arguments(tune)["relay_node"]
     assert {"measurement_min:=-1.0", "measurement_timeout:=5.0"} < set(words)
     assert not any(word.startswith("command_m") and "inf" in word for word in words)
@@ -513,6 +515,7 @@ def test_a_proof_that_is_lost_tells_how_its_joint_is_left(monkeypatch, off, take
     tune = SimpleNamespace(
         _loop=loop, _manager=manager, _at_controller=lambda: ({}, {}), _space="/tune",
         client=SimpleNamespace(),
+        _start_controller=lambda: JointLoop._start_controller(tune),
         options=SimpleNamespace(keep_gains=False, yes=True, namespace="tune"),
         _put_back=lambda: JointLoop._put_back(tune), left=lambda: JointLoop.left(tune),
         activation=lambda: JointLoop.activation(tune),

@@ -153,11 +153,11 @@ class OpenPage:
         """What the page says is going on."""
         return str(self.told.get("phase", ""))
 
-    def do(self, wish: str) -> None:
+    def do(self, wish: str, **more: Any) -> None:
         """Wish something."""
 
         def send() -> None:
-            self._socket.write_message(json.dumps({"do": wish, "loop": self._number}))
+            self._socket.write_message(json.dumps({"do": wish, "loop": self._number, **more}))
 
         self._loop.call_soon_threadsafe(send)
 

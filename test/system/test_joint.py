@@ -19,6 +19,7 @@ from builtin_interfaces.msg import Duration
 from loop_rig import RELIABLE, Rig
 from robot_rig import Robot
 from sensor_msgs.msg import JointState
+from served import OpenPage
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -46,6 +47,42 @@ def test_a_wheel_gets_verified_gains_while_its_controller_stays_active(rig: Rig)
     assert "Designed for control_toolbox_conditional_integration every 0.01 s" in file.read_text()
     after = robot.gains()
     assert after != before and after[0] > 0.5
+    assert robot.history() == ["wheel_controller"]
+
+
+@pytest.mark.nightly
+def test_a_joint_is_tuned_on_a_page_which_verifies_gains_between_two_tunes(rig: Rig) -> None:
+    robot = Robot(rig)
+    before = robot.gains()
+    command = robot.tune("--web")
+    found = rig.until(lambda: re.search(r"the page is at (\S+)", command.log), "the address", 60.0)
+    page = OpenPage(found[1])
+
+    def accepted() -> bool:
+        count = page.told["checked"]
+        page.do("check")
+        rig.until(lambda: page.told["checked"] > count and page.phase == "idle", "a check")
+        return bool(page.told["accepted"])
+
+    rig.until(lambda: page.told.get("form"), "the form")
+    assert [row["name"] for row in page.told["form"]] == ["within", "amplitude"]
+    rig.until(accepted, "a check that accepts", 60.0)
+    told = {name: found for _, name, found in page.told["checks"]}
+    assert told["moves"].startswith("the reference of left_wheel about")
+    page.do("start")
+    rig.until(lambda: page.told["status"] == "the tune is complete", "the tune", 240.0)
+    assert robot.gains() == before
+    rig.until(lambda: page.told["controller"].endswith("/controller_node"), "it", 60.0)
+    rig.until(lambda: page.told["step"], "the usual step")
+    asked = page.subjects[0]["first"]
+    page.do("apply", of=0, asked=asked, step=page.told["step"], accept_doubtful=True)
+    rig.until(lambda: "verification" in page.told["status"], "the verification", 120.0)
+    assert page.told["status"].startswith("verification passed"), page.told["status"]
+    assert robot.gains() != before
+    # It makes way for the next tune.
+    rig.until(accepted, "a second check that accepts", 60.0)
+    command.signal(signal.SIGINT)
+    assert command.wait(60.0) in (0, 3), command.log
     assert robot.history() == ["wheel_controller"]
 
 

@@ -29,7 +29,7 @@ export function table(host, rows, cells) {
 }
 
 // Lines of a checklist that say what a tune will do.
-const PLAN = ["levels", "limits", "at rest", "expected", "time"];
+const PLAN = ["moves", "within", "switches", "holds", "levels", "limits", "at rest", "expected", "time"];
 const MARKS = { ok: ["\u2713", "good"], note: ["!", "warn"], NO: ["\u2715", "bad"] };
 
 function checklist(host, checks) {
