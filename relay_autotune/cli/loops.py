@@ -156,8 +156,11 @@ class Loop:
 
     def left(self) -> str:
         """Return in which state a tune without gains has left the plant; empty: not known."""
-        others = self.other_commander()
-        return others and f"the safe command was sent, but {others} commands, too, and goes on"
+        if others := self.other_commander():
+            return f"the safe command was sent, but {others} commands, too, and goes on"
+        if self.client.result.why.code in (Code.SILENT_SENSOR, Code.SENSOR_GONE):
+            return "the safe command was sent, and no measurement shows whether the plant has it"
+        return ""
 
     def other_commander(self) -> str:
         """Return who else commanded during a tune that ended for that; empty: nobody."""
@@ -326,7 +329,12 @@ class TopicLoop(Loop):
 
     def left(self) -> str:
         """Return at which command the loop is left, and whether that is the right one."""
-        command = self.options.at
+        command, topic = self.options.at, self.options.command
+        if not self.client.is_taken(topic):
+            return (
+                f"the safe command {command:.6g} u was sent, but nobody takes commands from "
+                f"{topic} any more: see to the plant"
+            )
         if told := super().left():
             return told
         if self._rests_elsewhere:

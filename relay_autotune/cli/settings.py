@@ -267,11 +267,13 @@ class Answers:
         return self._from.get(name) or flag_of(SETTING[name])
 
     def now(self, name: str) -> str:
-        """Return what is seen of a setting's quantity now; empty: nothing."""
-        if name == "amplitude":
-            return ""
+        """Return what is known of a setting's quantity now; empty: nothing."""
         value = self._seen(name)
-        return "" if math.isnan(value) else f"{value:.4g} {SETTING[name].unit} now"
+        if name == "amplitude" or math.isnan(value):
+            return ""
+        told = f"{value:.4g} {SETTING[name].unit}"
+        # The command is not measured.
+        return f"{told} now" if name == "within" else f"the present one given as {told}"
 
     def _seen(self, name: str) -> float:
         """Return the present value of a setting's quantity; NaN: it is not known."""

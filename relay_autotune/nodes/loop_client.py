@@ -507,6 +507,15 @@ class LoopClient:
         """
         return self._node.count_publishers(topic) > 0
 
+    def is_taken(self, topic: str) -> bool:
+        """Return whether another node subscribes to a topic.
+
+        :param topic: its name.
+        """
+        own = self._node.get_fully_qualified_name()
+        ends = self._node.get_subscriptions_info_by_topic(self._resolved(topic))
+        return any(quality.who(end) != own for end in ends)
+
     def owners(self, ending: str) -> list[str]:
         """Return the full names of the nodes with a service that has this ending.
 

@@ -32,7 +32,7 @@ from relay_autotune.cli import loops, report, settings, terminal, tune_loop
 from relay_autotune.cli.after_tune import AfterTune
 from relay_autotune.cli.loops import Loop, TopicLoop
 from relay_autotune.cli.own_nodes import OwnNodes, namespace_of_joint, ros_arguments
-from relay_autotune.cli.settings import Kind, kind_of
+from relay_autotune.cli.settings import Answers, Kind, kind_of
 from relay_autotune.cli.terminal import (
     GoBack,
     agreed_step,
@@ -985,8 +985,9 @@ def test_after_an_end_that_would_come_again_the_same_command_is_not_offered_agai
     )  # fmt: skip
     last = np.array([5.0, 9.1 if outside else 6.2])
     client: Any = SimpleNamespace(
-        result=result, record=lambda patience: SimpleNamespace(measurement=last)
-    )
+        result=result, record=lambda patience: SimpleNamespace(measurement=last),
+        is_taken=lambda topic: topic == "/u",
+    )  # fmt: skip
     loop = topic_loop(client, given)
     assert loop.left_its_limits is outside
     assert left_at in loop.left()
@@ -1003,13 +1004,38 @@ def test_after_a_tune_beside_another_program_its_command_is_not_said_to_be_the_l
     why = Code.SECOND_PUBLISHER(topic="/u", others="a node not known yet")
     client: Any = SimpleNamespace(
         result=ended(why), record=lambda patience: SimpleNamespace(measurement=np.array([5.0])),
-        others_on=lambda topic: "/pid",
+        others_on=lambda topic: "/pid", is_taken=lambda topic: True,
     )  # fmt: skip
     loop = topic_loop(client, given)
     assert loop.left() == "the safe command was sent, but /pid commands, too, and goes on"
     first, again = AfterTune(loop, parser).repeated(None)
     assert first == ("first", "end /pid, which commands /u") and again[0] == "run it again"
     assert Loop(client, given).left().startswith("the safe command was sent, but a node not known")
+
+
+def test_a_plant_that_has_gone_is_not_said_to_be_left_at_the_safe_command() -> None:
+    words = ["--measurement", "/y", "--command", "/u", "--at", "40", "--within", "3", "9"]
+    why = Code.SILENT_SENSOR(topic="/y", silence=5.0)
+    client: Any = SimpleNamespace(result=ended(why), is_taken=lambda topic: False)
+    loop = topic_loop(client, tune_loop._parser().parse_args(words))
+    assert loop.left() == (
+        "the safe command 40 u was sent, but nobody takes commands from /u any more: see to the "
+        "plant"
+    )
+    # One that was killed is known for some 20 s.
+    client.is_taken = lambda topic: True
+    told = "the safe command was sent, and no measurement shows whether the plant has it"
+    assert loop.left() == told
+
+
+def test_the_present_command_is_asked_about_as_it_was_given_and_not_as_measured() -> None:
+    given = tune_loop._parser().parse_args(
+        ["--measurement", "/y", "--command", "/u", "--at", "40"]
+    )
+    answers = Answers(given)
+    answers.measured = 5.0
+    assert answers.now("within") == "5 y now"
+    assert answers.now("command_within") == answers.now("at") == "the present one given as 40 u"
 
 
 def test_a_joint_whose_model_was_cancelled_is_said_to_have_its_reference(
