@@ -12,7 +12,7 @@ import argparse
 import os
 import re
 import shlex
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,7 +34,7 @@ from relay_autotune.cli.arguments import (
     say,
 )
 from relay_autotune.cli.table import compared_lines, rows, table
-from relay_autotune.cli.terminal import WIDEST, Stages
+from relay_autotune.cli.terminal import WIDEST, Working
 from relay_autotune.errors import NotThereError, RelayAutotuneError, SelectionError, defect
 from relay_autotune.exchange.export import EXPORTS, WITHOUT_LAW, Target, exported
 from relay_autotune.identification.known import Known
@@ -54,8 +54,6 @@ if TYPE_CHECKING:
     from relay_autotune.report.case import Case
     from relay_autotune.result import Shaping
     from relay_autotune.web.shape import DesignRequest
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -122,18 +120,15 @@ def work(job: Job) -> Done:
     return replay(job)[0]
 
 
-def replay(
-    job: Job, progress: Progress | None = None, stages: Stages | None = None
-) -> tuple[Done, tuple[Analysis, ...]]:
+def replay(job: Job, working: Working | None = None) -> tuple[Done, tuple[Analysis, ...]]:
     """Read, identify and tune; return also the analyses themselves.
 
     :param job: what to do.
-    :param progress: called with how much of a bag is read, and of how much.
-    :param stages: tells what the computation is at.
+    :param working: is told how much of a bag is read, and what the computation is at.
     """
     said: list[str] = []
     try:
-        analyses = analysed(job, said, progress, stages)
+        analyses = analysed(job, said, working)
         if job.export is not None:
             gains, text = _exported(analyses, *job.export, accept_doubtful=job.accept_doubtful)
             said += [f"{job.name}: {warning}" for warning in gains.warnings]
@@ -173,25 +168,23 @@ def status_of(analyses: Sequence[Analysis]) -> int:
     )
 
 
-def analysed(
-    job: Job, said: list[str], progress: Progress | None = None, stages: Stages | None = None
-) -> tuple[Analysis, ...]:
+def analysed(job: Job, said: list[str], working: Working | None = None) -> tuple[Analysis, ...]:
     """Read, identify and tune.
 
     :param job: what to do.
     :param said: gets sentences for standard error.
-    :param progress: called with how much of a bag is read, and of how much.
-    :param stages: tells what the computation is at.
+    :param working: is told how much of a bag is read, and what the computation is at.
     :raises RelayAutotuneError: if the recording cannot be read, or lacks what is asked for.
     """
+    progress = working.share if working else None
     if job.jointly:
         records: list[Record] = []
         for path in job.paths:
             recording = read_experiments(path, job.selection, progress)
             said += [f"{path}: {note}" for note in recording.notes]
             records += recording.experiments
-        if stages is not None:
-            stages.begin(map(len, records))
+        if working is not None:
+            working.begin(map(len, records))
         return (analyse_jointly(records, **vars(job.task)),)
     try:
         recording = read_experiments(job.paths, job.selection, progress)
@@ -202,9 +195,9 @@ def analysed(
         own = replace(job.selection, measurement=None, command=None, time=None)
         recording = read_experiments(job.paths, own, progress)
     said += [f"{job.name}: {note}" for note in recording.notes]
-    if stages is not None:
-        stages.begin(map(len, recording.experiments))
-    tell = stages or (lambda _: None)
+    if working is not None:
+        working.begin(map(len, recording.experiments))
+    tell = working.at if working else lambda _: None
     found = tuple(analyse(each, **vars(job.task), tell=tell) for each in recording.experiments)
     return agreed(found) if recording.of_one_process else found
 

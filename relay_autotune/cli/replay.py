@@ -39,7 +39,7 @@ from relay_autotune.cli.report import (
     write_report,
 )
 from relay_autotune.cli.table import heading
-from relay_autotune.cli.terminal import ProgressLine, Stages, require_new, width, write
+from relay_autotune.cli.terminal import Working, require_new, width, write
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.gains import FORMS
 from relay_autotune.result import Analysis
@@ -234,16 +234,15 @@ def _into_file(jobs: Sequence[Job], options: argparse.Namespace) -> int:
         status = results.status
         if len(left) < len(jobs):
             say(PROGRAM, f"{len(jobs) - len(left)} of {len(jobs)} bags are in {results.path}")
-        progress = ProgressLine(f"{PROGRAM}: bags done")
         failed = 0
-        for count, (_, done) in enumerate(_as_they_come(left, options), start=1):
-            progress.clear()
-            _tell(done)
-            results.add(done.name, done.text)
-            failed += done.status not in (DONE, DOUBTFUL)
-            status = worst(status, done.status)
-            progress(count, len(left))
-        progress.clear()
+        with Working(f"working on {len(left)} bags", patient=True) as working:
+            for count, (_, done) in enumerate(_as_they_come(left, options), start=1):
+                working.clear()
+                _tell(done)
+                results.add(done.name, done.text)
+                failed += done.status not in (DONE, DOUBTFUL)
+                status = worst(status, done.status)
+                working.share(count, len(left))
     of_these = f", {failed} of them without a model" if failed else ""
     say(PROGRAM, f"{len(left)} bags done{of_these}; results in {options.output}")
     return status
@@ -263,9 +262,8 @@ def _in_order(
                 due += 1
         return
     for job in jobs:
-        progress = ProgressLine(f"{PROGRAM}: {job.name} read")
-        with Stages(progress) as stages:
-            found = replay(job, progress, stages)
+        with Working(f"reading {job.name}", patient=True) as working:
+            found = replay(job, working)
         yield found
 
 

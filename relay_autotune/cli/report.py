@@ -31,7 +31,7 @@ from relay_autotune.cli.arguments import (
     worst,
 )
 from relay_autotune.cli.jobs import Job, add_analysis, analysed, jobs_of, present_of
-from relay_autotune.cli.terminal import ProgressLine, Stages
+from relay_autotune.cli.terminal import Working
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.record.record import Record
@@ -242,8 +242,8 @@ def _cases(job: Job) -> list[Case]:
 
     said: list[str] = []
     try:
-        with Stages(ProgressLine(f"{PROGRAM}: {job.name} read")) as stages:
-            found = analysed(job, said, stages=stages)
+        with Working(f"reading {job.name}", patient=True) as working:
+            found = analysed(job, said, working)
         return [case_of(analysis, job.name) for analysis in found]
     finally:
         for sentence in said:

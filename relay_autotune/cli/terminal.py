@@ -17,9 +17,9 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError
 from relay_autotune.text import LOGGED_EVERY, TOLD_EVERY, duration, in_units, visible
@@ -198,9 +198,6 @@ def write(text: str, path: str | None) -> None:
 # Time after which a terminal is first told what is being done [s]: several short works in a row
 # must not be silent together.
 _SOON = 0.3
-# Time before the first share of a work is shown, and between two of them [s].
-_PATIENCE = 1.0
-_INTERVAL = 0.2
 
 
 class StatusLine:
@@ -237,65 +234,6 @@ class StatusLine:
             self._shown = False
 
 
-class ProgressLine:
-    """The share of a work that is done; on a terminal only.
-
-    :param what: what is being done.
-    """
-
-    def __init__(self, what: str) -> None:
-        self._what = what
-        self._next = time.monotonic() + _PATIENCE
-        self._line = StatusLine()
-
-    def __call__(self, done: int, total: int) -> None:
-        """Show how much is done of how much."""
-        if not self._line.in_place or total <= 0 or time.monotonic() < self._next:
-            return
-        self._next = time.monotonic() + _INTERVAL
-        self._line(f"{self._what}: {100.0 * min(done / total, 1.0):.0f} %")
-
-    def clear(self) -> None:
-        """Remove the line, so that something else can be written."""
-        self._line.clear()
-
-
-class Stages:
-    """Say what the computation of models is at, and how long it will take, until the block ends.
-
-    :param before: a line that is shown until then.
-    """
-
-    def __init__(self, before: ProgressLine) -> None:
-        self._before = before
-        self._stack = ExitStack()
-        self._working: Working | None = None
-
-    def begin(self, samples: Iterable[int]) -> None:
-        """Begin to compute.
-
-        :param samples: number of samples of each record.
-        """
-        # Imported here, because a question needs no arrays.
-        from relay_autotune.expected_time import expected_time
-
-        self._before.clear()
-        working = Working("computing the model", expected_time(*samples))
-        self._working = self._stack.enter_context(working)
-
-    def __call__(self, stage: str) -> None:
-        """Note what begins."""
-        if self._working is not None:
-            self._working.at(stage)
-
-    def __enter__(self) -> Stages:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
-        self._before.clear()
-
-
 class Working:
     """Say each second on standard error what is being done, until the block ends.
 
@@ -304,21 +242,35 @@ class Working:
 
     :param what: what is being done.
     :param expected: how long it takes about [s]; NaN: not known.
+    :param patient: True: without a terminal it is not said before ten seconds.
     """
 
-    def __init__(self, what: str, expected: float = math.nan) -> None:
-        self._what, self._expected = what, expected
+    def __init__(self, what: str, expected: float = math.nan, *, patient: bool = False) -> None:
+        self._what, self._expected, self._patient = what, expected, patient
         self._stage = ""
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._tell, name="progress", daemon=True)
 
-    def __enter__(self) -> Working:
+    def __enter__(self) -> Self:
+        self._over, self._line = threading.Event(), StatusLine()
+        self._thread = threading.Thread(target=self._tell, name="progress", daemon=True)
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._over.set()
         self._thread.join()
+
+    def begin(self, samples: Iterable[int]) -> None:
+        """Compute models from now on.
+
+        :param samples: number of samples of each record.
+        """
+        # Imported here, because a question needs no arrays.
+        from relay_autotune.expected_time import expected_time
+
+        self.__exit__()
+        self._what, self._expected = "computing the model", expected_time(*samples)
+        self._stage, self._patient = "", False
+        self.__enter__()
 
     def at(self, stage: str) -> None:
         """Note what the work is at; any thread may call it.
@@ -327,18 +279,26 @@ class Working:
         """
         self._stage = f": {stage}"
 
+    def share(self, done: int, total: int) -> None:
+        """Note how much is done of how much."""
+        self.at(f"{100.0 * min(done / max(total, 1), 1.0):.0f} %")
+
+    def clear(self) -> None:
+        """Remove the line, so that something else can be written."""
+        self._line.clear()
+
     def _tell(self) -> None:
-        began, line = time.monotonic(), StatusLine()
-        known = math.isfinite(self._expected)
-        about = f" of about {max(self._expected, 1.0):.0f} s" if known else ""
+        began, line, expected = time.monotonic(), self._line, self._expected
+        known = math.isfinite(expected)
+        about = f" of about {max(expected, 1.0):.0f} s" if known else ""
         wait = _SOON if line.in_place else TOLD_EVERY
-        if known and self._expected < LOGGED_EVERY and not line.in_place:
+        if (self._patient or (known and expected < LOGGED_EVERY)) and not line.in_place:
             wait = LOGGED_EVERY
         while not self._over.wait(wait):
             wait = TOLD_EVERY if line.in_place else LOGGED_EVERY
             ran = time.monotonic() - began
-            if known and ran > self._expected:
-                about = f", about {max(self._expected, 1.0):.0f} s were expected"
+            if known and ran > expected:
+                about = f", about {max(expected, 1.0):.0f} s were expected"
             line(f"{self._what}, {duration(ran)}{about}{self._stage}")
         line.clear()
 
