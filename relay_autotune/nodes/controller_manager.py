@@ -45,6 +45,7 @@ class ManagedController:
     :param rate: of its updates [Hz]; 0: not told.
     :param needs: the command interfaces that it writes, in its own order; (): not configured.
     :param claims: those that it owns now.
+    :param reads: the state interfaces that it reads.
     """
 
     name: str
@@ -53,6 +54,7 @@ class ManagedController:
     rate: float
     needs: tuple[str, ...]
     claims: tuple[str, ...]
+    reads: tuple[str, ...] = ()
 
     @property
     def is_active(self) -> bool:
@@ -226,6 +228,7 @@ def _listed(found: Iterable[Any]) -> tuple[ManagedController, ...]:
             float(getattr(each, "update_rate", 0)),
             tuple(each.required_command_interfaces),
             tuple(each.claimed_interfaces),
+            tuple(each.required_state_interfaces),
         )
         for each in found
     )
@@ -249,6 +252,28 @@ def above(controllers: Iterable[ManagedController], names: Iterable[str]) -> tup
         found += more
         below |= set(more)
     return tuple(found)
+
+
+def broadcasting(
+    controllers: Collection[ManagedController], names: Collection[str]
+) -> tuple[str, ...]:
+    """Return the active controllers that command nothing, and publish the states of a chain.
+
+    Such as a joint_state_broadcaster, which reads all states, those that controllers export, too.
+    A manager does not switch off a controller that is chained while another one reads its states,
+    unless that one is switched off, or started again, in the same request.
+
+    :param controllers: all that are loaded.
+    :param names: of those that are switched off.
+    """
+    chained = {name for name in names if above(controllers, [name])}
+    return tuple(
+        each.name
+        for each in controllers
+        if each.is_active
+        and not each.needs
+        and any(state.partition("/")[0] in chained for state in each.reads)
+    )
 
 
 def in_the_way(
@@ -311,8 +336,8 @@ def opened(
 ) -> Iterator[None]:
     """Pass commands to a joint, whose controllers are off until the end of the block.
 
-    One strict switch does both. At the end of the block, however it ends, the former controllers
-    are active again, which the manager's list has to show.
+    One strict switch does both, and starts again what publishes their states. At the end of the
+    block, however it ends, the former controllers are active again, as the manager's list shows.
 
     :param manager: the manager.
     :param forward: name of the controller that passes commands on.
@@ -322,8 +347,9 @@ def opened(
     """
     error = None
     try:
+        again = broadcasting(manager.controllers(), former)
         # An answer that is lost need not be a refusal.
-        manager.switch([forward], former)
+        manager.switch([forward, *again], [*former, *again])
         yield
     except BaseException as raised:
         error = raised

@@ -10,6 +10,7 @@ import shlex
 from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,9 +32,11 @@ from relay_autotune.nodes.controller_manager import (
     ControllerManager,
     ManagedController,
     above,
+    broadcasting,
     close,
     forwarding,
     in_the_way,
+    opened,
 )
 from relay_autotune.nodes.gains_place import (
     controller_of,
@@ -280,6 +283,36 @@ class Switching:
 
     def still_active(self, name):
         return lambda: "" if name in self.active else f"{name} is off"
+
+
+class Chained(Switching):
+    """A chain whose states a broadcaster reads; no controller is left that one still reads."""
+
+    states = ManagedController(
+        "states", "joint_state_broadcaster/JointStateBroadcaster", "active", 100.0, (), (),
+        ("left/velocity", "pid/left/velocity"),
+    )  # fmt: skip
+
+    def __init__(self) -> None:
+        self.active = {"pid", "base", "states"}
+
+    def controllers(self, patience=0.0):
+        return (*super().controllers(), self.states)
+
+    def switch(self, on, off, patience=0.0):
+        if "pid" in off and "states" not in off:
+            raise LoopError("Unable to deactivate controller with name 'pid'")
+        super().switch(on, off)
+
+
+def test_what_reads_the_states_of_a_chain_is_started_again_as_it_is_opened() -> None:
+    manager: Any = Chained()
+    with opened(manager, "one", ("pid", "base"), lambda: None):
+        assert manager.active == {"one", "states"}
+    assert manager.active == {"pid", "base", "states"}
+    # A controller without others above it is switched off whoever reads its states.
+    manager.active = {"pid", "states"}
+    assert broadcasting(manager.controllers(), ("pid",)) == ()
 
 
 @pytest.mark.parametrize("is_open", [True, False])
