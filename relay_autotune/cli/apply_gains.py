@@ -279,7 +279,7 @@ def found_entries(result: Any, noise_std: float = math.nan) -> list[tuple[str, s
     :param result: the `Verify.Result`.
     :param noise_std: of the measurement [y]; NaN: not known.
     """
-    from relay_autotune.control.verification import NOISE_ALLOWANCE
+    from relay_autotune.control.verification import NOISE_ALLOWANCE, SETTLED
 
     told = f"failed: {result.reason}"
     if result.passed:
@@ -297,15 +297,18 @@ def found_entries(result: Any, noise_std: float = math.nan) -> list[tuple[str, s
         text = (
             f"{step.step:+g} {'y' if setpoint else 'u'}: overshoot "
             f"{100.0 * step.overshoot:.0f}{unsure} % "
-            f"(predicted {100.0 * step.overshoot_predicted:.0f} %), settled after "
+            f"(predicted {100.0 * step.overshoot_predicted:.0f} %), settled within "
+            f"{100.0 * SETTLED:.0f} % after "
             f"{duration(step.settling_time)} (predicted {duration(step.settling_time_predicted)})"
         )
         found.append((name, text))
     if result.steps:
-        gain, ms = (
-            " and ".join(f"{getattr(step, name):.2f}" for step in result.steps)
-            for name in ("gain_ratio", "ms")
+        spread = (float(why.values.get("gain_uncertainty", 0.0)) for why in whys)
+        gain = " and ".join(
+            f"{step.gain_ratio:.2f}" + f" +- {most:.2f}" * (most > 0.0)
+            for step, most in zip(result.steps, spread, strict=True)
         )
+        ms = " and ".join(f"{step.ms:.2f}" for step in result.steps)
         predicted = result.steps[0].ms_predicted
         told = f"gain {gain} times the model's, Ms {ms} (predicted {predicted:.2f})"
         found.append(("process", told))

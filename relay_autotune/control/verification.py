@@ -528,6 +528,10 @@ def compare(
     rms = math.sqrt(float(np.mean((deviation - predicted) ** 2)))
     measured = describe(time, deviation, step, noise_std)
     expected = describe(time, predicted, step)
+    # White noise leaves the gain this uncertain.
+    slope = (predict(_SLIGHTLY * ratio) - predict(ratio)) / math.log(_SLIGHTLY)
+    size = float(np.linalg.norm(slope))
+    unsure = NOISE_ALLOWANCE * ratio * noise_std / size if size > 0.0 else 0.0
     ms, ms_predicted = _ms(control, scaled(model, ratio)), _ms(control, model)
     compared = _comparisons(measured, expected, ratio, ms, ms_predicted, time)
     # Written so that NaN does not pass.
@@ -535,7 +539,8 @@ def compare(
     narrow = [c.numbers for c in compared if c.taken > _NARROW]
     numbers = (
         f"overshoot {measured.overshoot:.0%} (predicted {expected.overshoot:.0%}), "
-        f"settling {measured.settling_time:.3g} s ({expected.settling_time:.3g} s), "
+        f"settling to {100.0 * SETTLED:.0f} % {measured.settling_time:.3g} s "
+        f"({expected.settling_time:.3g} s), "
         f"IAE {measured.iae:.3g} ({expected.iae:.3g}), Ms {ms:.2f} ({ms_predicted:.2f}), "
         f"gain {ratio:.2f} times the model's"
     )
@@ -546,7 +551,8 @@ def compare(
         why = Code.NARROWLY(narrow=", ".join(narrow), numbers=numbers)
     return Comparison(
         passed=not problems,
-        why=why,
+        # Beside the sentence, for those who tell the gain by itself.
+        why=why.plus(gain_uncertainty=unsure),
         measured=measured,
         expected=expected,
         predicted=predicted,

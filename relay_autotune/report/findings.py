@@ -92,7 +92,7 @@ _EFFECTS = (
         "the smaller, the sooner it is over",
     ),
     ("overshoot", "overshoot", "", "after a step of the set-point"),
-    ("settling time", "settling_time", "s", "after a step of the set-point"),
+    ("settling time (2 %)", "settling_time", "s", "after a step of the set-point"),
 )
 # Name, value and unit of a number of gains, and what it means.
 Compared = tuple[str, str, str, str]

@@ -86,10 +86,10 @@ def test_gains_that_are_missing_or_unstable_are_told_as_such() -> None:
 def test_a_verdict_has_five_lines() -> None:
     load = step(kind=Verification.LOAD, step=0.3, gain_ratio=1.01)
     result = Verify.Result(passed=True, reason="long numbers", steps=[step(), load])
-    lines = laid_out(verdict_entries(result, Controller(0.6, 0.75, 0.2, 0.02)), 99)
+    lines = laid_out(verdict_entries(result, Controller(0.6, 0.75, 0.2, 0.02)), 120)
     assert len(lines) == 5
     assert "passed: the loop does what the model predicts" in lines[0]
-    told = "overshoot 10 % (predicted 11 %), settled after 3.8 s (predicted 4.2 s)"
+    told = "overshoot 10 % (predicted 11 %), settled within 5 % after 3.8 s (predicted 4.2 s)"
     assert f"+0.5 y: {told}" in lines[1]
     assert "+0.3 u" in lines[2]
     assert "gain 0.96 and 1.01 times the model's, Ms 1.37 and 1.37 (predicted 1.39)" in lines[3]
@@ -104,6 +104,14 @@ def test_an_overshoot_that_the_noise_could_move_has_its_uncertainty() -> None:
     assert "overshoot 10 % (predicted 11 %)" in "\n".join(
         laid_out(found_entries(result, 0.004), 99)
     )
+
+
+def test_the_gain_of_the_process_has_its_uncertainty_where_the_noise_is_known() -> None:
+    noisy = step(gain_ratio=1.04)
+    fill_reason(noisy.why, Code.AS_PREDICTED(numbers="numbers").plus(gain_uncertainty=0.062))
+    result = Verify.Result(passed=True, reason="long", steps=[step(), noisy])
+    lines = laid_out(found_entries(result), 120)
+    assert "gain 0.96 and 1.04 +- 0.06 times the model's" in lines[3]
 
 
 def test_what_passed_close_to_a_limit_is_called_narrow() -> None:

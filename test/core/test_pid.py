@@ -170,6 +170,20 @@ def test_the_process_itself_passes(step, noise_std):
 
 
 @pytest.mark.long
+def test_the_uncertainty_of_the_gain_is_three_standard_deviations_of_it():
+    step, noise_std, rng = Step(setpoint=0.5), 0.02, np.random.default_rng(8)
+    time, exact = measured(PROCESS, step)
+    noise = noise_std * rng.standard_normal((40, time.size))
+    found = [
+        compare(Control(GAINS), PROCESS, step, time, exact + n, noise_std=noise_std) for n in noise
+    ]
+    spread = np.std([each.gain_ratio for each in found])
+    told = np.mean([each.why["gain_uncertainty"] for each in found])
+    assert told == pytest.approx(3.0 * spread, rel=0.35)
+    assert compare(Control(GAINS), PROCESS, step, time, exact).why["gain_uncertainty"] == 0.0
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("step", [Step(setpoint=0.5), Step(load=0.4)])
 @pytest.mark.parametrize("factor", [0.4, 2.2])
 def test_a_process_of_another_gain_fails_with_its_ratio(step, factor):

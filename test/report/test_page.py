@@ -379,7 +379,9 @@ def test_the_present_gains_stand_beside_the_new_ones_with_what_both_do(monkeypat
     assert beside_present(wild)[-1][0][1] == "unstable"
     assert "loop unstable" in change_of(wild)
     assert rows["overshoot"][0] == f"{100.0 * expected.overshoot:.0f} %"
-    assert float(rows["settling time"][1]) == pytest.approx(case.best_gains.settling_time, 0.01)
+    assert float(rows["settling time (2 %)"][1]) == pytest.approx(
+        case.best_gains.settling_time, 0.01
+    )
 
 
 def test_what_new_gains_change_is_said_in_words() -> None:
