@@ -92,6 +92,14 @@ class _Cluster:
         """True if they lie in the right half plane."""
         return bool(self.centre.real > 0.0)
 
+    @property
+    def shares(self) -> FloatArray:
+        """What the outputs take of each state, of a complex one of both parts, (outputs, ...)."""
+        if self.rows.dtype.kind != "c":
+            return self.rows
+        # Re(r x) = Re r Re x - Im r Im x
+        return (self.share * self.rows.conj()).view(np.float64)
+
     def motions(self, times: FloatArray) -> list[list[Coordinates]]:
         """Return exp(A t): what state k, then m, has of the state m before.
 
@@ -109,31 +117,30 @@ class _Cluster:
             powers = [decay]
             for j in range(1, size):
                 powers.append(powers[-1] * times / j)
-            return [[powers[max(m - k, 0)] for m in range(size)] for k in range(size)]
+            return [[powers[m - k] for m in range(size)] for k in range(size)]
         x = (times * self.scale) ** np.arange(self.terms.shape[0])[:, None]
         flat = self.terms.reshape(self.terms.shape[0], -1)
         return list((flat.T @ x * decay).reshape(size, size, -1))
 
-    def states(self, changes: FloatArray, steps: FloatArray, *, backward: bool) -> Coordinates:
+    def states(self, gaps: FloatArray, steps: FloatArray, *, backward: bool) -> Coordinates:
         """Return the states just after each change of the input, shape (n, m)."""
         if not (backward and self.growing):
-            return self._followed(np.diff(changes), steps)
+            return self._followed(gaps, steps)
         # Backward in time, each step is undone before the earlier one is reached.
-        before = self._followed(np.diff(changes[::-1]), -steps[::-1])[:, ::-1]
+        before = self._followed(-gaps[::-1], -steps[::-1])[:, ::-1]
         before[-1] += steps
         return before
 
     def _followed(self, gaps: FloatArray, kicks: FloatArray) -> Coordinates:
         moved = self.motions(gaps)
-        size = len(self.nodes)
-        states = np.zeros((size, kicks.size), dtype=np.result_type(moved[0][0], kicks))
-        for k in range(size - 1, -1, -1):
-            drive = np.zeros(kicks.size, dtype=states.dtype)
-            if k == size - 1:
-                drive[:] = kicks
-            for m in range(k + 1, size):
-                drive[1:] += moved[k][m] * states[m, :-1]
-            states[k] = recursion(moved[k][k], drive)
+        last = len(self.nodes) - 1
+        # The drives first, then what follows from them.
+        states = np.zeros((last + 1, kicks.size), dtype=self.rows.dtype)
+        states[last] = kicks
+        for k in range(last, -1, -1):
+            for m in range(k + 1, last + 1):
+                states[k, 1:] += moved[k][m] * states[m, :-1]
+            states[k] = recursion(moved[k][k], states[k])
         return states
 
     def matrix(self, time: float) -> Coordinates:
@@ -148,10 +155,11 @@ def recursion(decay: Coordinates, drive: Coordinates) -> Coordinates:
     :param decay: of magnitude at most 1, shape (m - 1,).
     :param drive: shape (m,).
     """
-    # Each column of the bands holds a diagonal element, and what the next x takes of this one.
-    bands = np.ones((drive.size, 2), dtype=decay.dtype).T
+    # Each column of the bands holds a diagonal element, which is one and is not read, and what the
+    # next x takes of this one.
+    bands = np.empty((drive.size, 2), dtype=decay.dtype).T
     bands[1, :-1] = -decay
-    solve = ztbtrs if np.iscomplexobj(decay) else dtbtrs
+    solve = ztbtrs if decay.dtype.kind == "c" else dtbtrs
     found: Coordinates = solve(bands, drive[:, None], uplo="L", diag="U")[0][:, 0]
     return found
 
@@ -224,12 +232,10 @@ def _of_inverse(nodes: Sequence[complex], others: Sequence[complex]) -> list[com
 def _of_inverses(nodes: Sequence[complex], others: Sequence[complex]) -> ComplexArray:
     """Return the divided differences ``(1/prod (s - q))[e_j, ..., e_k]``, shape (n, n)."""
     size = len(nodes)
-    found = np.zeros((size, size), dtype=np.complex128)
-    equal = all(e == nodes[0] for e in nodes)
+    equal = nodes.count(nodes[0]) == size
     series = _of_inverse(nodes, others)
-    for j in range(size):
-        found[j, j:] = series[: size - j] if equal or j == 0 else _of_inverse(nodes[j:], others)
-    return found
+    rows = (series[: size - j] if equal else _of_inverse(nodes[j:], others) for j in range(size))
+    return np.array([[0j] * j + row for j, row in enumerate(rows)])
 
 
 class Modes:
@@ -257,17 +263,15 @@ class Modes:
             raise ModelError("a process has at least as many poles as zeros")
         lead = math.prod((complex(t) for t in constants), start=1.0 + 0j)
         groups = _groups(poles, horizon)
-        every = [
-            e
-            for group in groups
-            for pole in group
-            for e in ([pole, pole.conjugate()] if _is_upper(group) else [pole])
-        ]
+        every: list[complex] = []
+        for group in groups:
+            pairs = [e for pole in group for e in (pole, pole.conjugate())]
+            every += pairs if _is_upper(group) else group
         self._clusters: list[_Cluster] = []
         first = 0
         for group in groups:
             upper = _is_upper(group)
-            equal = all(e == group[0] for e in group)
+            equal = group.count(group[0]) == len(group)
             centre = group[0] if equal else sum(group) / len(group)
             others = list(every)
             for e in group:
@@ -276,7 +280,7 @@ class Modes:
             degree = numerators.shape[1]
             rows = numerators @ np.array(_of_powers(group, degree)) @ _of_inverses(group, others)
             rows = rows / lead
-            real = all(e.imag == 0.0 for e in group)
+            real = not any(e.imag for e in group)
             count = 0 if equal else _term_count(group, centre, horizon)
             scale = abs(centre) or 1.0
             terms = None if equal else _terms(group, centre, scale, count)
@@ -289,6 +293,7 @@ class Modes:
             share = 2.0 if upper else 1.0
             self._clusters.append(_Cluster(nodes, centre, place, share, terms, scale, rows))
             first = place.stop
+        self._shares = np.concatenate([c.shares for c in self._clusters], axis=1)
         self.size = first
         self.input_direction = np.zeros(first)
         self.input_direction[[c.place.stop - 1 for c in self._clusters]] = 1.0
@@ -314,6 +319,7 @@ class Modes:
             replace(c, rows=c.rows @ (np.diag(c.nodes) + np.eye(len(c.nodes), k=1)))
             for c in self._clusters
         ]
+        found._shares = np.concatenate([c.shares for c in found._clusters], axis=1)
         return found
 
     def rest(self) -> Coordinates:
@@ -365,7 +371,8 @@ class Modes:
             own free motion.
         :return: of each cluster, shapes (n, m).
         """
-        return [c.states(changes, steps, backward=backward) for c in self._clusters]
+        gaps = np.diff(changes)
+        return [c.states(gaps, steps, backward=backward) for c in self._clusters]
 
     def outputs(
         self,
@@ -381,21 +388,15 @@ class Modes:
         :return: shape (p, k).
         """
         motions: list[FloatArray] = []
-        shares: list[FloatArray] = []
         for cluster, own in zip(self._clusters, states, strict=True):
             moved = cluster.motions(time)
             at = [row[0] if segment is None else row.take(segment) for row in own]
-            for k, rows in enumerate(cluster.rows.T):
+            for k in range(len(at)):
                 now = moved[k][k] * at[k]
                 for m in range(k + 1, len(at)):
                     now = now + moved[k][m] * at[m]
-                if np.iscomplexobj(now):
-                    motions += [now.real, now.imag]
-                    shares += [cluster.share * rows.real, -cluster.share * rows.imag]
-                else:
-                    motions.append(now)
-                    shares.append(rows)
-        return np.stack(shares, axis=1) @ np.stack(motions)
+                motions += [now.real, now.imag] if now.dtype.kind == "c" else [now]
+        return self._shares @ np.concatenate(motions).reshape(len(motions), -1)
 
 
 def _is_upper(group: list[complex]) -> bool:

@@ -99,7 +99,7 @@ def oscillating_pair(natural_frequency: float, damping: float) -> tuple[complex,
     )
 
 
-Polynomial = NDArray[np.float64]
+Polynomial = list[float]
 
 TWO_LAGS = (TIME_CONSTANT_1, TIME_CONSTANT_2)
 PAIR = (NATURAL_FREQUENCY, DAMPING)
@@ -127,11 +127,11 @@ class Lag:
 
         :param theta: (log tau,).
         """
-        return np.array((self._sign, math.exp(theta[0])))
+        return [self._sign, math.exp(theta[0])]
 
     def derivatives(self, theta: FloatArray) -> list[Polynomial]:
         """Return the derivative of :meth:`polynomial` by log tau."""
-        return [np.array((0.0, math.exp(theta[0])))]
+        return [[0.0, math.exp(theta[0])]]
 
     def constants(self, theta: FloatArray) -> list[complex]:
         """Return T in ``1 + T s`` of one power of the factor [s]: tau, or -tau."""
@@ -173,12 +173,12 @@ class Quadratic:
         :param theta: (log(1/w0), log zeta).
         """
         t, zeta = math.exp(theta[0]), math.exp(theta[1])
-        return np.array((1.0, 2.0 * zeta * t, t * t))
+        return [1.0, 2.0 * zeta * t, t * t]
 
     def derivatives(self, theta: FloatArray) -> list[Polynomial]:
         """Return the derivatives of :meth:`polynomial` by both parameters."""
         t, zeta = math.exp(theta[0]), math.exp(theta[1])
-        return [np.array((0.0, 2.0 * zeta * t, 2.0 * t * t)), np.array((0.0, 2.0 * zeta * t, 0.0))]
+        return [[0.0, 2.0 * zeta * t, 2.0 * t * t], [0.0, 2.0 * zeta * t, 0.0]]
 
     def constants(self, theta: FloatArray) -> list[complex]:
         """Return the two time constants, a conjugate pair where zeta < 1 [s]."""
@@ -276,13 +276,13 @@ class Denominator:
             then their derivatives by each parameter in turn, then by the dead time.
         """
         own = self.split(theta)
-        factors = [f.polynomial(t).tolist() for f, t in zip(self.factors, own, strict=True)]
+        factors = [f.polynomial(t) for f, t in zip(self.factors, own, strict=True)]
         whole = _product(factors)
         rows = [[0.0] * k + whole for k in powers]
         for j, (factor, part) in enumerate(zip(self.factors, own, strict=True)):
             others = _product(factors[:j] + factors[j + 1 :])
             for derivative in factor.derivatives(part):
-                change = _product([(-factor.multiplicity * derivative).tolist(), others])
+                change = _product([[-factor.multiplicity * c for c in derivative], others])
                 rows += [[0.0] * k + change for k in powers]
         if by_dead_time:
             rows += [[0.0] * (k + 1) + [-c for c in whole] for k in powers]
