@@ -20,6 +20,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -130,15 +131,20 @@ class RelayRun:
     :param settings: the relay.
     :param command: the command with its exact switch instants.
     :param cycles: every whole cycle, with exact times and peaks.
+    :param output: returns the noise-free measurement at instants of the run [y].
     :param time: sample times [s], shape (n,).
-    :param measurement: noise-free measurement there [y], shape (n,).
     """
 
     settings: RelaySettings
     command: PiecewiseConstant
     cycles: tuple[Cycle, ...]
+    output: Callable[[FloatArray], FloatArray]
     time: FloatArray
-    measurement: FloatArray
+
+    @cached_property
+    def measurement(self) -> FloatArray:
+        """The noise-free measurement at the sample times [y], shape (n,)."""
+        return self.output(self.time)
 
     def record(self, *, noise_std: float = 0.0, rng: np.random.Generator | None = None) -> Record:
         """Return the samples as a record, with noise that the relay did not see.
@@ -239,7 +245,7 @@ def simulate_relay(
     settings: RelaySettings,
     *,
     cycles: int,
-    time: ArrayLike = (),
+    time: ArrayLike | int = (),
     operating_point: float | None = None,
     kick: float | None = None,
     told: int | None = None,
@@ -255,8 +261,8 @@ def simulate_relay(
     :param model: the process.
     :param settings: levels, set-point, hysteresis.
     :param cycles: whole cycles to run.
-    :param time: instants of the samples [s], not decreasing, shape (n,); those after the end of
-        the last cycle are left out.
+    :param time: instants of the samples [s], not decreasing, shape (n,), of which those after the
+        end of the last cycle are left out; or how many, evenly spaced up to the last switch.
     :param operating_point: measurement at rest [y]; default: the set-point.
     :param kick: how far above the set-point the measurement must rise before the first
         switch [y]; default: the hysteresis.
@@ -271,8 +277,6 @@ def simulate_relay(
     oscillation = max((abs((1.0 / t).imag) for t in model.time_constants), default=0.0)
     corners = (min(constants), oscillation)
     level = settings.setpoint if operating_point is None else operating_point
-    samples = np.asarray(time, dtype=np.float64)
-    measured = np.full(samples.shape, math.nan)
 
     z, now, arrived = modes.rest(), 0.0, settings.baseline
     # The first level moves the measurement up, to its first threshold.
@@ -309,8 +313,6 @@ def simulate_relay(
         if step > 0.0:
             piece.length = step
             pieces.append(piece)
-            inside = (samples >= now) & (samples <= now + step) & np.isnan(measured)
-            measured[inside] = piece.output(samples[inside] - now)
             z, now = modes.move(z, step), now + step
         if switching:
             if now <= switches[-1][0]:
@@ -326,10 +328,19 @@ def simulate_relay(
                 )
     times, levels = (np.array(column) for column in zip(*switches, strict=True))
     command = PiecewiseConstant(times, levels, settings.baseline)
-    known = ~np.isnan(measured)
     first = 0 if told is None else max(cycles - told, 0)
     found = tuple(_cycle(k, times, pieces, settings) for k in range(first, cycles))
-    return RelayRun(settings, command, found, samples[known], measured[known])
+    ends = np.array([piece.begin for piece in pieces[1:]] + [now])
+
+    def output(at: FloatArray) -> FloatArray:
+        number, y = np.searchsorted(ends, at), np.empty(at.size)
+        for k in np.unique(number).tolist():
+            y[number == k] = pieces[k].output(at[number == k] - pieces[k].begin)
+        return y
+
+    samples = np.linspace(0.0, times[-1], time) if isinstance(time, int) else np.asarray(time)
+    inside = samples[(samples >= 0.0) & (samples <= now)]
+    return RelayRun(settings, command, found, output, inside)
 
 
 def _no_delay(time: float) -> ModelError:

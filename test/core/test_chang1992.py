@@ -292,8 +292,7 @@ def _record(
     relay = RelaySettings(
         5.0, 40.0, 1.0, bias, share * swing, 0.3, reverse_acting=model.gain < 0.0
     )
-    end = simulate_relay(model, relay, cycles=7).command.times[-1]
-    run = simulate_relay(model, relay, cycles=7, time=np.linspace(0.0, end, 7 * 800))
+    run = simulate_relay(model, relay, cycles=7, time=7 * 800)
     return run.record(noise_std=noise * swing, rng=np.random.default_rng(3))
 
 

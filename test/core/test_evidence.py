@@ -43,8 +43,7 @@ def record_of(
     outcome: Outcome = Outcome.COMPLETED,
 ) -> Record:
     relay = RelaySettings(5.0, 1.0, 0.5, bias, 0.02, reverse_acting=process.process_sign < 0)
-    end = simulate_relay(process, relay, cycles=cycles).command.times[-1]
-    run = simulate_relay(process, relay, cycles=cycles, time=np.linspace(0.0, end, samples))
+    run = simulate_relay(process, relay, cycles=cycles, time=samples)
     return replace(run.record(), outcome=outcome, experiment_id="one")
 
 

@@ -37,8 +37,7 @@ def _record(
     """Return three cycles about an operating point of its own."""
     model = TransferFunction.fopdt(*process)
     relay = RelaySettings(at, 40.0, 1.0, bias, 0.0)
-    end = simulate_relay(model, relay, cycles=3).command.times[-1]
-    run = simulate_relay(model, relay, cycles=3, time=np.linspace(0.0, end, samples))
+    run = simulate_relay(model, relay, cycles=3, time=samples)
     std = noise * float(np.mean(np.abs(run.measurement - at))) * math.sqrt(math.pi / 2.0)
     return run.record(noise_std=std, rng=np.random.default_rng(seed))
 

@@ -100,8 +100,7 @@ def _records(
     for number, added in enumerate((0.0, 1.5)):
         reverse = process.gain < 0.0
         relay = RelaySettings(5.0, 1.0, 0.7, bias, epsilon, added, reverse_acting=reverse)
-        end = simulate_relay(process, relay, cycles=8).command.times[-1]
-        run = simulate_relay(process, relay, cycles=8, time=np.linspace(0.0, end, 3200))
+        run = simulate_relay(process, relay, cycles=8, time=3200)
         rng = np.random.default_rng(number)
         found.append(run.record(noise_std=noise, rng=rng))
     return found

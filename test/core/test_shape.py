@@ -42,9 +42,7 @@ def exact_shape(model: TransferFunction, relay: RelaySettings = IDEAL) -> Shape:
 
 
 def ideal_record(model, relay=IDEAL, cycles=6, samples=1200, noise=0.0, seed=0, kick=None):
-    end = simulate_relay(model, relay, cycles=cycles, kick=kick).command.times[-1]
-    time = np.linspace(0.0, end, samples)
-    run = simulate_relay(model, relay, cycles=cycles, time=time, kick=kick)
+    run = simulate_relay(model, relay, cycles=cycles, time=samples, kick=kick)
     # NSR, the ratio of the means of the absolute values
     mean = float(np.mean(np.abs(run.measurement - relay.setpoint)))
     std = noise * mean * math.sqrt(math.pi / 2.0)

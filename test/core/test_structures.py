@@ -138,8 +138,7 @@ def _record(
     model: TransferFunction, noise: float = 0.0, seed: int = 0, samples: int = 1000
 ) -> Record:
     relay = RelaySettings(0.0, 0.0, 1.0)
-    end = simulate_relay(model, relay, cycles=5).command.times[-1]
-    run = simulate_relay(model, relay, cycles=5, time=np.linspace(0.0, end, samples))
+    run = simulate_relay(model, relay, cycles=5, time=samples)
     signal = float(np.mean(np.abs(run.measurement)))
     std = noise * signal * math.sqrt(math.pi / 2.0)
     return run.record(noise_std=std, rng=np.random.default_rng(seed))

@@ -24,8 +24,7 @@ FOPDT = TransferFunction.fopdt(1.65, 20.0, 10.0)
 
 
 def record_of(model, relay, cycles=6, samples=1200, noise_std=0.0):
-    end = simulate_relay(model, relay, cycles=cycles).command.times[-1]
-    run = simulate_relay(model, relay, cycles=cycles, time=np.linspace(0.0, end, samples))
+    run = simulate_relay(model, relay, cycles=cycles, time=samples)
     return run.record(noise_std=noise_std, rng=np.random.default_rng(4))
 
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record, RelaySettings
@@ -28,8 +26,7 @@ def record_of(
     relay = RelaySettings(
         5.0, 1.0, 0.5, bias, 0.05, extra_delay, reverse_acting=process.process_sign < 0
     )
-    end = simulate_relay(process, relay, cycles=cycles).command.times[-1]
-    run = simulate_relay(process, relay, cycles=cycles, time=np.linspace(0.0, end, 300 * cycles))
+    run = simulate_relay(process, relay, cycles=cycles, time=300 * cycles)
     return replace(run.record(), experiment_id=experiment_id, outcome=outcome)
 
 

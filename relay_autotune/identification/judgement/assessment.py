@@ -172,13 +172,7 @@ def _limit_cycle(
         change = abs(a.period_high - b.period_high) + abs(a.period_low - b.period_low)
         if change <= _TOLERANCE * b.period:
             break
-    at = b.start + _instants(b.period_high, b.period_low)
-    if all(t.real > 0.0 for t in model.time_constants):
-        # Without growing modes, the response to the whole command is computed at once.
-        delayed = replace(model, dead_time=model.dead_time + settings.extra_delay)
-        return b, rest + response(delayed, at, run.command)
-    again = simulate_relay(model, settings, cycles=count, operating_point=rest, kick=kick, time=at)
-    return b, again.measurement
+    return b, run.output(b.start + _instants(b.period_high, b.period_low))
 
 
 def _instants(high: float, low: float) -> FloatArray:
