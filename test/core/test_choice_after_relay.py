@@ -63,7 +63,10 @@ def test_a_pair_faster_than_its_lag_is_no_drift(seed):
     assert not any("drift" in w for w in found.warnings)
 
 
-@pytest.mark.parametrize(("noise_std", "within"), [(0.0, 1e-9), (0.002, 3e-3)])
+@pytest.mark.parametrize(
+    ("noise_std", "within"),
+    [pytest.param(0.0, 1e-9, marks=pytest.mark.nightly), (0.002, 3e-3)],
+)
 @pytest.mark.parametrize(
     "model",
     [
@@ -91,6 +94,7 @@ def test_an_inverse_response_is_found_that_a_fopdt_does_not_show(model, noise_st
     assert found.ultimate_gain == pytest.approx(_point(model).gain, rel=within)
 
 
+@pytest.mark.by_day(1)
 @pytest.mark.parametrize("seed", [3, 15])
 def test_a_first_swing_that_a_fopdt_lacks_is_not_left_out(seed):
     model = TransferFunction(1.0, (), (1.0, 0.2, 0.04, 0.008), 0, 0.0)

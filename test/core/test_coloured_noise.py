@@ -14,7 +14,7 @@ from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
 from relay_autotune.analysis import analyse
-from relay_autotune.identification.known import NOTHING
+from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.waveform.candidates import (
     Candidate,
     FitContext,
@@ -153,14 +153,16 @@ def test_in_a_colour_structures_are_weighted_by_akaikes_criterion():
     assert max(support(stable)[1:]) > 0.1  # a richer structure counts beside the chosen FOPDT
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.nightly)])
-def test_a_load_that_walks_at_random_beside_a_relay_test(seed):
+@pytest.mark.by_day(1)
+@pytest.mark.parametrize(("structure", "seed"), [("fopdt", 0), ("", 0), ("", 1)])
+def test_a_load_that_walks_at_random_beside_a_relay_test(structure, seed):
     """A tenth of the error of least squares, which bends gain and dead time to the load."""
     true = ultimate_point(PROCESS)
     assert true is not None
     rng = np.random.default_rng(seed)
     load = 0.01 * np.cumsum(rng.standard_normal(1400))
-    found = identify_waveform(relay_test(0.005 * rng.standard_normal(1400), load))
+    record = relay_test(0.005 * rng.standard_normal(1400), load)
+    found = identify_waveform(record, Known(structure=structure))
     assert found.ultimate_gain == pytest.approx(true.gain, rel=0.02)
     error = abs(found.ultimate_gain - true.gain)
     assert error < 3.5 * found.ultimate_gain_std
@@ -173,7 +175,8 @@ def test_a_heater_that_is_switched_on_with_the_first_sample():
     process = TransferFunction.sopdt(0.7, (150.0, 15.0), 5.0)
     rng = np.random.default_rng(5)
     y = 20.0 + response(process, time, u) + 0.1 * correlated(0.8, 900, rng)
-    found = identify_waveform(Record(time=time, measurement=y, command=u(time)))
+    record = Record(time=time, measurement=y, command=u(time))
+    found = identify_waveform(record, Known(structure="sopdt"))
     assert found.model.gain == pytest.approx(0.7, rel=0.05)
     slow = max(abs(t) for t in found.model.time_constants)
     assert slow == pytest.approx(150.0, rel=0.1)
@@ -204,7 +207,7 @@ def test_a_step_after_a_rest_of_few_samples_is_no_drift():
     tank = TransferFunction.fopdt(5.8, 98.0, 0.3)
     walk = np.cumsum(rng.normal(0.0, 0.012, time.size)) + rng.normal(0.0, 0.02, time.size)
     level = 12.0 + response(tank, time, record.input()) + walk
-    found = identify_waveform(replace(record, measurement=level)).model
+    found = identify_waveform(replace(record, measurement=level), Known(structure="fopdt")).model
     assert found.gain / found.time_constants[0] == pytest.approx(5.8 / 98.0, rel=0.05)
     assert found.dead_time < 2.0
 
@@ -350,6 +353,7 @@ def test_an_integrator_that_is_driven_one_way_is_no_lag_of_many_records():
     assert found.best_gains is not None
 
 
+@pytest.mark.nightly
 def test_a_thermostat_that_began_off_its_rest_shows_the_direction_of_its_heater():
     # The free start is seen beside two lags; beside one, the colour of the noise took its place.
     record = _thermostat(np.random.default_rng(0))

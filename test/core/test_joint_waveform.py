@@ -109,6 +109,6 @@ def test_a_joint_model_gets_gains():
     records = [
         replace(r, outcome=Outcome.COMPLETED) for r in (_record(), _record(bias=0.3, seed=1))
     ]
-    analysis = analyse_jointly(records, method="waveform")
+    analysis = analyse_jointly(records, method="waveform", known=FOPDT)
     assert analysis.model is not None
     assert analysis.best_gains is not None

@@ -90,7 +90,7 @@ def gains(analysed):
 
 def shown_beside(model, record, w):
     """Return mean and scatter of what a record shows beside a model."""
-    found = other_model(identified(record), model)
+    found = other_model(in_halves(record), model)
     draws = difference(found, record).draws(w, 200)
     return draws.mean(axis=0), draws.std(axis=0)
 

@@ -35,6 +35,7 @@ def _true_ms(gains) -> float:
 
 
 # Up to three quarters of an interval before the row that shows the change.
+@pytest.mark.by_day(1)
 @pytest.mark.parametrize(
     ("interval", "instants"),
     [(30.0, (609.0, 2240.0, 3906.0)), (60.0, (615.0, 2240.0, 3920.0))],

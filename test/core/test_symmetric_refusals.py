@@ -30,7 +30,7 @@ PROCESS = TransferFunction.fopdt(2.0, 3.0, 1.0)
 
 
 @pytest.mark.long
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=60)
 @given(
     amplitude=st.floats(1e-6, 2.0),
     dead_time=st.one_of(st.just(0.0), st.floats(1e-6, 0.55)),

@@ -13,6 +13,7 @@ import pytest
 from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import TuningError
+from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.loop.analysis import analyse_loop, is_stable
 from relay_autotune.loop.gains import Controller
@@ -71,7 +72,8 @@ def _identified(noise: float):
     model = TransferFunction.fopdt(1.65, 20.0, 10.0)
     relay = RelaySettings(5.0, 40.0, 1.0, 0.3, 0.1)
     run = simulate_relay(model, relay, cycles=4, time=800)
-    return identify_waveform(run.record(noise_std=noise, rng=np.random.default_rng(0)))
+    record = run.record(noise_std=noise, rng=np.random.default_rng(0))
+    return identify_waveform(record, Known(structure="fopdt"))
 
 
 def test_the_ensemble_of_a_covariance_has_its_spread():

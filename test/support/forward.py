@@ -123,7 +123,7 @@ def peak_of_harmonics(lags: tuple[float, ...], period: float, harmonics: int) ->
     :param period: P [s].
     :param harmonics: terms of the sum.
     """
-    angle = np.linspace(0.0, math.pi, 256 * harmonics, endpoint=False)
+    angle = np.linspace(0.0, math.pi, 32 * harmonics, endpoint=False)
     w, tau = 2.0 * math.pi / period, np.array(lags)[:, None]
     k = 2.0 * np.arange(harmonics) + 1.0
     size = np.prod(np.hypot(1.0, k * w * tau), axis=0) * k
