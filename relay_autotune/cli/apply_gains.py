@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +50,8 @@ PROGRAM = "apply_gains"
 
 # An uncertainty of the overshoot that is worth showing, as a fraction of the step.
 _SEEN = 0.03
+# How long a verification waits until the loop is at rest [s].
+REST_WITHIN = 60.0
 # How long to look for the controller_node [s].
 _FOUND_WITHIN = 5.0
 
@@ -96,7 +98,7 @@ def _parser() -> argparse.ArgumentParser:
         help="write the gains, for pid_controller or the law that they are for; apply nothing",
     )  # fmt: skip
     parser.add_argument(
-        "--wait", type=finite, default=60.0, metavar="S",
+        "--wait", type=finite, default=REST_WITHIN, metavar="S",
         help="how long to wait until the loop is at rest [s] (%(default)s)",
     )  # fmt: skip
     parser.set_defaults(stays=True)
@@ -173,7 +175,7 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
     :return: whether the gains are in force, and why their step failed; empty: it did not.
     """
     with Working("asking for the gains"):
-        present, model, noise = client.in_force(), client.model(), client.noise()
+        present, model = client.in_force(), client.model()
         gains, doubt = client.waiting()
     if not options.verify_only:
         _require_trust(doubt, options)
@@ -205,21 +207,49 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
     new = None if options.verify_only else gains
     with noted(lambda text: say(PROGRAM, text)) as leave:
         try:
-            result = client.prove(step, options.load, options.wait, shown, leave, new)
+            result, entries = verified(
+                client, step, shown, leave, new,
+                load=options.load, patience=options.wait, stays=options.stays,
+            )  # fmt: skip
         finally:
             shown.clear()
-        try:
-            now = client.in_force()
-            unproven = not result.passed and new is not None and client.has(new)
-            entries = verdict_entries(
-                result, now, stays=options.stays, noise_std=noise, unproven=unproven
-            )
-        except LoopError as error:
-            told = f"not known: {error}; before the proof: {_numbers(present)}"
-            entries = [*found_entries(result, noise), ("gains in force", told)]
         for entry in entries:
             tell(*entry)
     return result.passed, "" if result.passed else result.reason
+
+
+def verified(
+    client: GainsClient,
+    step: float,
+    tell: Callable[[str], None],
+    leave: Callable[[], bool],
+    new: Controller | None,
+    *,
+    load: float = 0.0,
+    patience: float = REST_WITHIN,
+    stays: bool = True,
+) -> tuple[Any, list[tuple[str, str]]]:
+    """Verify gains, and return the `Verify.Result` with what it has found: names and texts.
+
+    :param client: of the controller_node, which was found.
+    :param step: of the set-point [y].
+    :param tell: called with what is waited for.
+    :param leave: returns True to end the verification.
+    :param new: the gains that wait, to be put in force; None: those in force are tried.
+    :param load: a second step, of the load [u]; 0: none.
+    :param patience: how long to wait until the loop is at rest [s].
+    :param stays: True if the controller_node goes on running.
+    """
+    before, noise = client.in_force(), client.noise()
+    result = client.prove(step, load, patience, tell, leave, new)
+    try:
+        now = client.in_force()
+        unproven = not result.passed and new is not None and client.has(new)
+        entries = verdict_entries(result, now, stays=stays, noise_std=noise, unproven=unproven)
+    except LoopError as error:
+        told = f"not known: {error}; before the proof: {_numbers(before)}"
+        entries = [*found_entries(result, noise), ("gains in force", told)]
+    return result, entries
 
 
 def _usual_step(client: GainsClient, options: argparse.Namespace) -> float:

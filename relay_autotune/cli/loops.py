@@ -91,7 +91,7 @@ class Loop:
         """Take the settings that relay_node has now; nobody else changes one of this command."""
         if self.has_own_nodes:
             return
-        names = list(self.answers.parameters_of(self.form))
+        names = [name for each in self.form for name in SETTING[each].parameters]
         with suppress(LoopError):
             self.answers.read(self.client.values(self.client.name, names, _ANSWERS))
 

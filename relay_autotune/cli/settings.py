@@ -398,10 +398,6 @@ class Answers:
         free = ("command_within",) if self["amplitude"] else ()
         return [SETTING[n].question for n in names if self[n] is None and n not in free]
 
-    def parameters_of(self, names: Sequence[str]) -> list[str]:
-        """Return the names of the parameters of relay_node that some settings set."""
-        return [parameter for name in names for parameter in SETTING[name].parameters]
-
     def parameters(self, names: Collection[str] = tuple(SETTING)) -> dict[str, Any]:
         """Return the parameters of relay_node that the known values set."""
         found: dict[str, Any] = {}

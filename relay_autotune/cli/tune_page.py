@@ -22,7 +22,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from relay_autotune.analysis import options_from
-from relay_autotune.cli.apply_gains import found_entries, verdict_entries
+from relay_autotune.cli.apply_gains import found_entries, verified
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say, worst
 from relay_autotune.cli.flow import checked, run
 from relay_autotune.cli.loops import Loop
@@ -38,7 +38,7 @@ from relay_autotune.cli.tune_view import (
     oscillation,
 )
 from relay_autotune.cli.tuned import Proof, Tuned
-from relay_autotune.errors import LoopError, RelayAutotuneError, TuningError
+from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError, TuningError
 from relay_autotune.exchange.messages import (
     fill_gains,
     gains_from_message,
@@ -213,8 +213,11 @@ class _LoopOnPage:
         try:
             if wish.settings:
                 self._loop.set(dict(wish.settings))
+            if lacking := self._loop.lacking():
+                told = "; ".join(lacking)
+                raise SelectionError(f"fill in the plan first (Start a tune): {told}")
             self._loop.before_tune()
-            self._plan = [] if self._loop.lacking() else self._loop.plan()
+            self._plan = self._loop.plan()
         except RelayAutotuneError as error:
             checked = live.told.checked + 1
             live.rest(str(error), good=False, checks=(), checked=checked, accepted=False)
@@ -225,12 +228,6 @@ class _LoopOnPage:
 
     def _check(self) -> None:
         """Ask whether a tune could start, and how."""
-        if lacking := self._loop.lacking():
-            self._live.rest(
-                f"fill in the plan first (Start a tune): {'; '.join(lacking)}",
-                good=False, checks=(), checked=self._live.told.checked + 1, accepted=False,
-            )  # fmt: skip
-            return
         self._live.tell(phase="checking", status="looking at the loop", tone="")
         result = checked(self._loop, 0.0)
         accepted = self._client.succeeded
@@ -428,8 +425,6 @@ def _awaited(client: TuneClient, work: Future[_Result], leave: Callable[[], bool
     return work.result()
 
 
-# How long a verification waits until the loop is at rest [s].
-_REST_WITHIN = 60.0
 # How long to look for the action of a controller_node [s].
 _FOUND_WITHIN = 5.0
 # Interval at which the gains in force are read while nothing else happens [s].
@@ -613,15 +608,14 @@ class GainsPage:
     def _verify(self, wish: PageCommand, controller: GainsClient, new: Controller | None) -> None:
         live = self.live
         self._begin_step("")
-        result = controller.prove(
-            wish.step, 0.0, _REST_WITHIN, lambda text: live.tell(status=text), self.leave, new
+        result, entries = verified(
+            controller, wish.step, lambda text: live.tell(status=text), self.leave, new
         )
         live.show("proof", [_document(step) for step in controller.steps_of(result)])
-        present = controller.in_force()
         live.rest(
             f"verification {'passed' if result.passed else 'failed'}: {result.reason}",
             good=result.passed,
-            proof=tuple(verdict_entries(result, present)),
+            proof=tuple(entries),
         )
 
 

@@ -496,7 +496,4 @@ def _expected(
     clear = clear_swing(noise, parameters.band(noise), seen)
     setpoint = rest.mean if math.isnan(parameters.setpoint) else parameters.setpoint
     swing = sought_swing(parameters, clear, noise, setpoint, seen)
-    return (
-        f"the levels grow until the measurement swings {swing:.2g} y each way, and not at all if "
-        f"the first ones make more{ends}"
-    )
+    return f"a swing of at least {swing:.2g} y each way, where the levels stop growing{ends}"

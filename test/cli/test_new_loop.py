@@ -59,7 +59,7 @@ from relay_autotune.text import in_units
 from relay_autotune.tuning import design
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import Verdict
-from relay_autotune.web.live import Live
+from relay_autotune.web.live import Live, PageCommand
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains, Reason
 
@@ -572,8 +572,7 @@ def test_a_check_before_the_plan_is_filled_says_what_is_missing() -> None:
     live = Live("tank")
     shown: Any = _LoopOnPage.__new__(_LoopOnPage)
     shown._loop, shown._live, shown._client, shown._options = loop, live, client, loop.options
-    shown._plan = []
-    shown._check()
+    assert not shown._is_set(PageCommand("check"))
     assert "present command" in live.told.status and "command of the actuator" in live.told.status
     assert "measurement" not in live.told.status and not live.told.accepted
     # A given amplitude is not searched for between the limits of the command.
