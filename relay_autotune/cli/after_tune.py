@@ -20,7 +20,7 @@ from typing import Any
 
 from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.cli.apply_gains import found_entries
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, as_typed, say
+from relay_autotune.cli.arguments import as_typed, say
 from relay_autotune.cli.loops import Steps
 from relay_autotune.cli.own_nodes import (
     PROGRAM,
@@ -41,7 +41,6 @@ from relay_autotune.cli.terminal import (
 )
 from relay_autotune.cli.tune_view import (
     Paint,
-    check_lines,
     document,
     next_commands,
     wants_colour,
@@ -100,8 +99,6 @@ class AfterTune(Tuned):
         result, options, client = self.result, self.options, self.client
         for refused in sorted(client.refused):
             say(PROGRAM, refused)
-        if not self.is_started:
-            return self._nothing_started()
         if not options.json:
             paint = Paint(colour=wants_colour(sys.stdout.isatty(), os.environ))
             print("\n".join(self.lines(paint, width())), flush=True)
@@ -135,23 +132,6 @@ class AfterTune(Tuned):
             model = transfer_function_from_message(result.transfer_function)
             print("\n" + "\n".join(beside(present, self.gains, model, width())), flush=True)
 
-    def _nothing_started(self) -> int:
-        """Print the result of a dry run, or why the node refuses."""
-        client, options = self.client, self.options
-        reason, checks = self.result.reason, self.loop.checklist(self.result)
-        if options.json:
-            told = {"accepted": client.succeeded, "reason": reason, "checks": checks}
-            print(json.dumps({"node": client.name} | told))
-        elif checks:
-            print("\n".join(check_lines(checks, width())))
-        if not client.succeeded:
-            say(PROGRAM, f"{self.loop.title} refuses: {reason}")
-            return NOTHING_FOUND
-        if not options.json:
-            again = [word for word in options.typed if word != "--dry-run"]
-            print(f"\nNext:\n  {'start it':<26} {prefix()}{shlex.join((PROGRAM, *again))}")
-        return DONE
-
     def repeated(self, proven: bool | None) -> Steps:
         """Return the commands that repeat the tune, with its answers as flags, or prove its gains.
 
@@ -173,9 +153,7 @@ class AfterTune(Tuned):
             return [
                 ("report it", "this is a defect: send its reason, and the recording if you can")
             ]
-        if told := loop.instead():
-            return [("once it rests", told)]
-        steps = [*loop.first(), ("run it again", again)]
+        steps = loop.again(again)
         if result.why.code == Code.SILENT_SENSOR:
             why = reason_from_message(result.why)
             told = f"the sensor of {why['topic']} (--dry-run tells its rate) and the load (uptime)"

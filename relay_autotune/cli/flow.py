@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import signal
 import time
-from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, Protocol
 
 from relay_autotune.errors import LoopError
@@ -43,11 +42,11 @@ def checked(loop: Loop, deadline: float) -> Any:
     :param deadline: until when its nodes may not know yet what they need.
     """
     client, options = loop.client, loop.options
-    # Right after its start the node does not know all of these yet.
+    # Right after its start a node of the command does not know all of these yet.
     awaited = {Code.REST_UNKNOWN, *[Code.NO_IDENTIFIER] * (not options.record_only)}
     while True:
         found = client.check(options.amplitude)
-        lacking = any(reason.code in awaited for reason in found.refusals)
+        lacking = loop.has_own_nodes and any(why.code in awaited for why in found.refusals)
         if not (client.not_ready_yet or lacking) or time.monotonic() > deadline:
             return found
         time.sleep(TICK)
@@ -64,11 +63,10 @@ def run(
     :param deadline: until when its nodes may not be ready; 0: they are asked once.
     :param tick: interval of the looks [s].
     """
-    client, options = loop.client, loop.options
-    # A dry run opens nothing.
-    with nullcontext(lambda _: "") if options.dry_run else loop.opened() as why_over:
+    client = loop.client
+    with loop.opened() as why_over:
         while True:
-            client.ask(options.amplitude, options.dry_run)
+            client.ask(loop.options.amplitude, dry_run=False)
             _follow(loop, face, interrupted, why_over, tick)
             if interrupted or not client.not_ready_yet or time.monotonic() > deadline:
                 return

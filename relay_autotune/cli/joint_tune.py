@@ -530,12 +530,12 @@ class JointLoop(Loop):
         """
         return gains_at(self._robot, self._loop.node, self._loop.places)
 
-    def first(self) -> Steps:
-        """Return how to activate its controller before another tune, if it is not active."""
+    def again(self, command: str) -> Steps:
+        """Return how to tune it again, and before how to activate its controller, if it is not."""
         with suppress(LoopError):
             if typed := self.activation():
-                return [("activate its controller", typed)]
-        return []
+                return [("activate its controller", typed), *super().again(command)]
+        return super().again(command)
 
     def apply(self, doubt: str) -> tuple[bool | None, str]:
         """Offer the gains to the controller, and verify them.

@@ -168,13 +168,12 @@ class Loop:
         of_others = Code.SECOND_PUBLISHER, Code.FOREIGN_COMMAND
         return str(why.values.get("others", "another node")) if why.code in of_others else ""
 
-    def instead(self) -> str:
-        """Return what to do in place of the same tune again; empty: it may be repeated."""
-        return ""
+    def again(self, command: str) -> Steps:
+        """Return how to tune it again, with what has to be done before.
 
-    def first(self) -> Steps:
-        """Return what has to be done before the same tune again."""
-        return []
+        :param command: that tunes it in the same way.
+        """
+        return [("run it again", command)]
 
     def present(self) -> Controller | None:
         """Return the gains in force in its controller; None: they are not known."""
@@ -353,19 +352,17 @@ class TopicLoop(Loop):
         found = super().other_commander()
         return found and (self.client.others_on(self.options.command) or found)
 
-    def first(self) -> Steps:
-        """Return what has to be done before the same tune again."""
-        others = self.other_commander()
-        return [("first", f"end {others}, which commands {self.options.command}")] * bool(others)
-
-    def instead(self) -> str:
-        """Return what to do in place of the same tune, which would drive the process away."""
+    def again(self, command: str) -> Steps:
+        """Return how to tune it again; the same tune may drive the process away."""
         if self._rests_elsewhere:
-            return "start again with --at and the command at which it rests"
+            told = "start again with --at and the command at which it rests"
+            return [("once it rests", told)]
         if self.left_its_limits:
             told = "the --at at which it rests, a smaller --amplitude, or wider --within"
-            return f"start again with {told}"
-        return ""
+            return [("once it rests", f"start again with {told}")]
+        others = self.other_commander()
+        first = [("first", f"end {others}, which commands {self.options.command}")] * bool(others)
+        return [*first, *super().again(command)]
 
     @property
     def _rests_elsewhere(self) -> bool:

@@ -16,6 +16,8 @@ doubtful. With --verify it is 1, too, where the gains did not pass.
 from __future__ import annotations
 
 import argparse
+import json
+import shlex
 import signal
 import sys
 import time
@@ -26,6 +28,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from relay_autotune.cli.arguments import (
+    DONE,
     NOTHING_FOUND,
     add_web,
     check_web,
@@ -40,7 +43,7 @@ from relay_autotune.cli.terminal import GoBack, Help, Working, agrees, require_n
 from relay_autotune.cli.tune_view import Shown, check_lines
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
-from relay_autotune.start import typed_for_parameter
+from relay_autotune.start import prefix, typed_for_parameter
 
 if TYPE_CHECKING:
     from relay_autotune.cli.loops import Loop
@@ -220,7 +223,7 @@ class Session:
         signals.note(signal.SIGINT)
         self._check_files()
         kind = kind_of(options)
-        if kind is not Kind.NODES:
+        if kind is not Kind.NODES or options.dry_run:
             # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.
             signals.obey()
             signals.raise_if_came()
@@ -236,9 +239,11 @@ class Session:
         if not options.web:
             print("".join(f"{line}\n" for line in check_lines(loop.plan(), width())), end="",
                   file=sys.stderr, flush=True)  # fmt: skip
-        asks = loop.has_own_nodes and not (options.dry_run or options.web)
+        asks = (loop.has_own_nodes or options.dry_run) and not options.web
         if asks and not self._is_agreed(loop, deadline):
             return NOTHING_FOUND
+        if options.dry_run:
+            return DONE
         # Imported here, so that --help does not load rclpy.
         from relay_autotune.nodes.lifetime import ending_signals
 
@@ -320,30 +325,46 @@ class Session:
                 )
 
     def _is_agreed(self, loop: Loop, deadline: float) -> bool:
-        """Show the plan of a tune, and return whether it is to start."""
-        client = loop.client
+        """Show the plan of a tune, and return whether it is to start; a dry run only shows it."""
+        options, may_go_back = self._options, loop.answers.may_go_back
         while True:
             with Working("looking at the loop"):
                 found = checked(loop, deadline)
-            lines = check_lines(loop.checklist(found), width())
-            print("\n".join(lines), flush=True, file=sys.stderr)
-            if not client.succeeded:
-                say(PROGRAM, f"{loop.title} refuses: {client.result.reason}")
+            if not self._may_start(loop, found):
                 return False
-            may_go_back = loop.answers.may_go_back
+            if options.dry_run:
+                again = [word for word in options.typed if word != "--dry-run"]
+                if not options.json:
+                    print(f"\nNext:\n  {'start it':<26} {prefix()}{shlex.join((PROGRAM, *again))}")
+                return True
             try:
-                return agrees("Start the tune?", yes=self._options.yes, back=may_go_back)
+                return agrees("Start the tune?", yes=options.yes, back=may_go_back)
             except GoBack:
                 loop.ask_again()
+
+    def _may_start(self, loop: Loop, found: Any) -> bool:
+        """Show whether a tune could start, and how.
+
+        :param found: the `Tune.Result` of a check, or of a tune that was refused.
+        """
+        client, options = loop.client, self._options
+        may, checks = client.succeeded, loop.checklist(found)
+        if options.json and (options.dry_run or not may):
+            told = {"accepted": may, "reason": found.reason, "checks": checks}
+            print(json.dumps({"node": client.name} | told))
+        elif checks:
+            shown = "\n".join(check_lines(checks, width()))
+            print(shown, flush=True, file=sys.stdout if options.dry_run else sys.stderr)
+        if not may:
+            say(PROGRAM, f"{loop.title} refuses: {found.reason}")
+        return may
 
     def _tune(self, loop: Loop, deadline: float) -> None:
         """Ask for the tune, and show it until its result is there."""
         from relay_autotune.nodes.lifetime import never_wait_for
 
-        options, signals = self._options, self._signals
-        shown = Shown(sys.stderr, live=sys.stderr.isatty() and not options.dry_run)
-        if not options.dry_run:
-            shown.say(f"tune of {loop.title}; Ctrl-C cancels it")
+        signals, shown = self._signals, Shown(sys.stderr, live=sys.stderr.isatty())
+        shown.say(f"tune of {loop.title}; Ctrl-C cancels it")
         # Signals must work even while writing to standard error would block.
         wait_again = never_wait_for(sys.stderr.fileno())
         try:
@@ -363,8 +384,12 @@ class Session:
         if loop.has_own_nodes and not loop.client.cancelled:
             # It came as the tune ended: nothing is asked for, or done, after that.
             self._signals.raise_if_came()
+        tune = AfterTune(loop, self._parser)
+        if not tune.is_started:
+            self._may_start(loop, tune.result)
+            return NOTHING_FOUND
         try:
-            return AfterTune(loop, self._parser).conclude()
+            return tune.conclude()
         except OSError:
             # The terminal is closed.
             if signal.SIGHUP in came:
