@@ -453,7 +453,7 @@ export class Live {
     const { node, form } = this.told;
     $("plan-title").textContent = `Tune ${node}`;
     $("form").replaceChildren();
-    for (const { name, question, unit, values, ends, now } of form) {
+    for (const { name, question, unit, values, ends, now, needed } of form) {
       const row = document.createElement("div");
       const label = document.createElement("label");
       label.textContent = `${question} [${unit}]`;
@@ -462,6 +462,7 @@ export class Live {
       for (let k = 0; k < ends; k += 1) {
         const input = document.createElement("input");
         Object.assign(input, { name, type: "number", step: "any", value: values && values[k] !== null ? values[k] : "" });
+        if (!needed) input.placeholder = "as it is";
         input.id = `form-${name}-${k}`;
         if (k === 0) label.htmlFor = input.id;
         else input.setAttribute("aria-label", `${question}, upper end`);
