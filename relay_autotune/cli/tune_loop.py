@@ -23,6 +23,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -195,6 +196,7 @@ class Signals:
             raise KeyboardInterrupt
 
 
+@dataclass
 class Session:
     """One run of the command, step by step: look, start, find, agree, tune, conclude.
 
@@ -203,23 +205,19 @@ class Session:
     :param ros: arguments for ROS.
     :param graph: where the clients end.
     :param nodes: where the nodes of the command end, before the clients.
+    :param signals: those that end it.
     """
 
-    def __init__(
-        self,
-        parser: argparse.ArgumentParser,
-        options: argparse.Namespace,
-        ros: list[str],
-        graph: ExitStack,
-        nodes: ExitStack,
-    ) -> None:
-        self._parser, self._options, self._ros = parser, options, ros
-        self._graph, self._nodes = graph, nodes
-        self._signals = Signals()
+    parser: argparse.ArgumentParser
+    options: argparse.Namespace
+    ros: list[str]
+    graph: ExitStack
+    nodes: ExitStack
+    signals: Signals = field(default_factory=Signals)
 
     def run(self) -> int:
         """Do all steps, and return the exit status."""
-        options, signals = self._options, self._signals
+        options, signals = self.options, self.signals
         signals.note(signal.SIGINT)
         self._check_files()
         kind = kind_of(options)
@@ -228,13 +226,9 @@ class Session:
             signals.obey()
             signals.raise_if_came()
         loops = self._looked_at(kind)
-        patience = self._started(loops)
-        self._find(loops, patience)
-        for each in loops:
-            each.joined()
+        patience = max(map(self._find, loops))
         # A sensor that is slower than that needs a longer --wait.
-        ready_within = max(self._options.wait, _READY_WITHIN)
-        deadline = time.monotonic() + min(patience, ready_within)
+        deadline = time.monotonic() + min(patience, max(options.wait, _READY_WITHIN))
         loop = loops[0]
         if not options.web:
             print("".join(f"{line}\n" for line in check_lines(loop.plan(), width())), end="",
@@ -259,7 +253,7 @@ class Session:
 
     def _check_files(self) -> None:
         """Refuse what could not be written or served, before any work is done."""
-        options = self._options
+        options = self.options
         if options.report:
             from relay_autotune.cli.report import check_output
 
@@ -275,7 +269,7 @@ class Session:
                 found = kind(*arguments)
         except ParameterError as error:
             raise SelectionError(str(error)) from None
-        self._graph.enter_context(found)
+        self.graph.enter_context(found)
         return found
 
     def _looked_at(self, kind: Kind) -> list[Loop]:
@@ -284,7 +278,7 @@ class Session:
         from relay_autotune.nodes.loop_client import LoopClient
         from relay_autotune.nodes.tune_client import TuneClient
 
-        options, ros = self._options, self._ros
+        options, ros = self.options, self.ros
 
         def client(space: str, robot: LoopClient | None = None) -> TuneClient:
             return self._joined(TuneClient, space, options.node, ros, robot)
@@ -300,33 +294,31 @@ class Session:
         # The loops of a page have settings of their own.
         return [Loop(client(space), argparse.Namespace(**vars(options))) for space in spaces]
 
-    def _started(self, loops: Sequence[Loop]) -> float:
-        """Start the nodes of the command, and return how long to wait for all [s]."""
-        patience: float = self._options.wait
-        for loop in loops:
-            if loop.has_own_nodes:
-                self._nodes.enter_context(loop.nodes)
-                for name, arguments in loop.arguments().items():
-                    loop.nodes.start(name, arguments)
-                loop.client.why_lost = loop.nodes.why_lost
-                loop.client.why_ended = partial(loop.nodes.why_lost, "relay_node")
-                patience = max(patience, START_WITHIN)
-        return patience
+    def _find(self, loop: Loop) -> float:
+        """Start its nodes, if they are those of the command, and find all; return the patience.
 
-    def _find(self, loops: Sequence[Loop], patience: float) -> None:
-        options = self._options
-        for loop in loops:
-            what = "starting the nodes for" if loop.has_own_nodes else "looking for"
-            with Working(f"{what} {loop.title}"):
-                loop.client.find(
-                    patience,
-                    needs_identifier=not (options.dry_run or options.record_only),
-                    leave=lambda: bool(self._signals.came),
-                )
+        :return: how long they may take [s].
+        """
+        options, patience, what = self.options, float(self.options.wait), "looking for"
+        if loop.has_own_nodes:
+            patience, what = max(patience, START_WITHIN), "starting the nodes for"
+            self.nodes.enter_context(loop.nodes)
+            for name, arguments in loop.arguments().items():
+                loop.nodes.start(name, arguments)
+            loop.client.why_lost = loop.nodes.why_lost
+            loop.client.why_ended = partial(loop.nodes.why_lost, "relay_node")
+        with Working(f"{what} {loop.title}"):
+            loop.client.find(
+                patience,
+                needs_identifier=not (options.dry_run or options.record_only),
+                leave=lambda: bool(self.signals.came),
+            )
+        loop.joined()
+        return patience
 
     def _is_agreed(self, loop: Loop, deadline: float) -> bool:
         """Show the plan of a tune, and return whether it is to start; a dry run only shows it."""
-        options, may_go_back = self._options, loop.answers.may_go_back
+        options, may_go_back = self.options, loop.answers.may_go_back
         while True:
             with Working("looking at the loop"):
                 found = checked(loop, deadline)
@@ -347,7 +339,7 @@ class Session:
 
         :param found: the `Tune.Result` of a check, or of a tune that was refused.
         """
-        client, options = loop.client, self._options
+        client, options = loop.client, self.options
         may, checks = client.succeeded, loop.checklist(found)
         if options.json and (options.dry_run or not may):
             told = {"accepted": may, "reason": found.reason, "checks": checks}
@@ -363,7 +355,7 @@ class Session:
         """Ask for the tune, and show it until its result is there."""
         from relay_autotune.nodes.lifetime import never_wait_for
 
-        signals, shown = self._signals, Shown(sys.stderr, live=sys.stderr.isatty())
+        signals, shown = self.signals, Shown(sys.stderr, live=sys.stderr.isatty())
         shown.say(f"tune of {loop.title}; Ctrl-C cancels it")
         # Signals must work even while writing to standard error would block.
         wait_again = never_wait_for(sys.stderr.fileno())
@@ -378,13 +370,13 @@ class Session:
         # Imported here, because it loads slowly and must not delay a tune.
         from relay_autotune.cli.after_tune import AfterTune
 
-        came = self._signals.came
+        came = self.signals.came
         # The tune is over, so a signal may end the command at once.
-        self._signals.obey()
+        self.signals.obey()
         if loop.has_own_nodes and not loop.client.cancelled:
             # It came as the tune ended: nothing is asked for, or done, after that.
-            self._signals.raise_if_came()
-        tune = AfterTune(loop, self._parser)
+            self.signals.raise_if_came()
+        tune = AfterTune(loop, self.parser)
         if not tune.is_started:
             self._may_start(loop, tune.result)
             return NOTHING_FOUND
