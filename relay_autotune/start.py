@@ -19,7 +19,6 @@ import sys
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
-from shutil import which
 
 
 def start(module: str, told_for: tuple[str, ...] = ()) -> int:
@@ -75,23 +74,6 @@ def _lacking(error: ModuleNotFoundError) -> str:
 
 # The extras of setup.py, with the names under which they are imported.
 _EXTRAS = {"report": ("jinja2", "markupsafe", "matplotlib"), "bags": ("mcap", "yaml")}
-
-
-def prefix() -> str:
-    """Return what stands before an executable of this package where the shell does not find it."""
-    return "" if which("replay") else "ros2 run relay_autotune "
-
-
-def typed_for_parameter(node: str, name: str, value: object) -> str:
-    """Return what to do here so that a node of this package has a parameter.
-
-    :param node: its full name.
-    :param name: of the parameter.
-    :param value: of the parameter.
-    """
-    if which("ros2"):
-        return f"type: ros2 param set {node} {name} {value}"
-    return f"start {node} with -p {name}:={value}"
 
 
 def command(module: str) -> int:

@@ -59,9 +59,9 @@ from relay_autotune.exchange.messages import (
     transfer_function_from_message,
 )
 from relay_autotune.loop.gains import Gains
+from relay_autotune.nodes.shell import prefix
 from relay_autotune.nodes.tables import parameters_of_law
 from relay_autotune.reasons import Code
-from relay_autotune.start import prefix
 from relay_autotune.text import digits
 from relay_autotune.verdict import Verdict
 

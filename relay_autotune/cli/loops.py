@@ -27,9 +27,9 @@ from relay_autotune.cli.terminal import UNITS, Working, asked, broken, width
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
 from relay_autotune.exchange.export import Target
 from relay_autotune.exchange.messages import reason_from_message
+from relay_autotune.nodes.shell import typed_for_parameter
 from relay_autotune.nodes.tables import FIXED
 from relay_autotune.reasons import Code, Reason
-from relay_autotune.start import typed_for_parameter
 from relay_autotune.text import in_units
 
 if TYPE_CHECKING:

@@ -44,7 +44,7 @@ from relay_autotune.cli.terminal import GoBack, Help, Working, agrees, require_n
 from relay_autotune.cli.tune_view import Shown, check_lines
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
-from relay_autotune.start import prefix, typed_for_parameter
+from relay_autotune.nodes.shell import prefix, typed_for_parameter
 
 if TYPE_CHECKING:
     from relay_autotune.cli.loops import Loop

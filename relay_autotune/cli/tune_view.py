@@ -22,10 +22,10 @@ from typing import Any, TextIO
 from relay_autotune.cli.table import gains_lines
 from relay_autotune.cli.terminal import UNITS, WIDEST, labelled
 from relay_autotune.exchange.messages import transfer_function_from_message
+from relay_autotune.nodes.shell import prefix
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.reasons import Code
-from relay_autotune.start import prefix
 from relay_autotune.text import LOGGED_EVERY, digits, duration, in_units
 from relay_autotune.verdict import Verdict
 

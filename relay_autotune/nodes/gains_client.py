@@ -31,11 +31,11 @@ from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.gains_place import gains_at, in_another_node, mapping_of, put_gains
 from relay_autotune.nodes.loop_client import ANSWER_WITHIN, GoneError, LoopClient
+from relay_autotune.nodes.shell import prefix
 from relay_autotune.nodes.tables import FIXED, GAINS, rate_from, rate_of
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import may_pass
 from relay_autotune.record.record import Record
-from relay_autotune.start import prefix
 from relay_autotune.text import TOLD_EVERY, duration, visible
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, Verification

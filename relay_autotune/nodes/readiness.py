@@ -30,11 +30,11 @@ from relay_autotune.nodes.goals import refused
 from relay_autotune.nodes.loop_ends import LoopSupervisor, RelayTopics
 from relay_autotune.nodes.parameters import merged, values_of
 from relay_autotune.nodes.quality import described, who, why_no_publisher, why_no_subscriber
+from relay_autotune.nodes.shell import prefix
 from relay_autotune.nodes.tables import TUNE_PARAMETERS
 from relay_autotune.nodes.watch import LastSamples, Sensor, require_own_time
 from relay_autotune.reasons import NONE, Code, Reason, reason_of
 from relay_autotune.record.record import Cycle
-from relay_autotune.start import prefix
 from relay_autotune.text import duration
 from relay_autotune_msgs.msg import Reason as ReasonMessage
 from relay_autotune_msgs.srv import StartTune

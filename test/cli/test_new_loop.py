@@ -26,7 +26,6 @@ from made_experiments import record_of
 from rcl_interfaces.srv import SetParametersAtomically
 
 from relay_autotune import reasons as core
-from relay_autotune import start
 from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.cli import loops, report, settings, terminal, tune_loop
 from relay_autotune.cli.after_tune import AfterTune
@@ -47,7 +46,7 @@ from relay_autotune.control.verification import StepRange
 from relay_autotune.errors import LoopError, ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS, Target, exported
 from relay_autotune.exchange.messages import fill_gains, fill_reason
-from relay_autotune.nodes import loop_client
+from relay_autotune.nodes import loop_client, shell
 from relay_autotune.nodes.controller import with_gains_file
 from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.nodes.readiness import Checklist, answer_of
@@ -278,7 +277,7 @@ def test_a_parameter_of_another_node_is_refused_with_what_sets_it(
     words: tuple[str, ...], given: str, has_ros2: bool, do: str,
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(start, "which", lambda name: "/opt" if has_ros2 else None)
+    monkeypatch.setattr(shell, "which", lambda name: "/opt" if has_ros2 else None)
     with pytest.raises(SystemExit):
         tune_loop.main(["--namespace", "tank", *words, "--ros-args", "-p", given])
     said = capsys.readouterr().err
@@ -724,7 +723,7 @@ def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
     given.typed = words
     given.at, given.within, given.command_within = 2.0, [30.0, 50.0], [0.0, 5.0]
     again = (
-        f"{start.prefix()}tune_loop --measurement /tank/level --command /tank/valve "
+        f"{shell.prefix()}tune_loop --measurement /tank/level --command /tank/valve "
         f"--at 2 --within 30 50 --command-within 0 5"
     )
     inside = SimpleNamespace(measurement=np.array([40.0]))

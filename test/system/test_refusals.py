@@ -22,8 +22,8 @@ from ros_domain import free_domain
 from std_msgs.msg import Float32, Float64
 
 from relay_autotune.exchange.messages import reason_from_message
+from relay_autotune.nodes.shell import prefix
 from relay_autotune.recordings import read_experiments
-from relay_autotune.start import prefix
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
 
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)

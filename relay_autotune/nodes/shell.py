@@ -1,0 +1,25 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""What can be typed here: not every machine has the `ros2` command."""
+
+from __future__ import annotations
+
+from shutil import which
+
+
+def prefix() -> str:
+    """Return what stands before an executable of this package where the shell does not find it."""
+    return "" if which("replay") else "ros2 run relay_autotune "
+
+
+def typed_for_parameter(node: str, name: str, value: object) -> str:
+    """Return what to do here so that a node of this package has a parameter.
+
+    :param node: its full name.
+    :param name: of the parameter.
+    :param value: of the parameter.
+    """
+    if which("ros2"):
+        return f"type: ros2 param set {node} {name} {value}"
+    return f"start {node} with -p {name}:={value}"
