@@ -26,7 +26,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_domain import mapped_segments, remove_leftovers
+from ros_domain import mapped_segments, release_unfinished, remove_leftovers
 
 from relay_autotune_msgs.srv import StartTune
 
@@ -106,6 +106,8 @@ class Rig:
     """Start executables in a domain of their own, and end all of them."""
 
     def __init__(self, domain: int, folder: Path) -> None:
+        # The run before may have been ended by a signal.
+        release_unfinished()
         self.domain = domain
         self.folder = folder
         self.records = folder / "records"
@@ -291,6 +293,7 @@ class Rig:
         self.executor.shutdown(timeout_sec=0.0)
         self.node.destroy_node()
         self.context.try_shutdown()
+        release_unfinished()
         killed = {path for process in self.processes for path in process.segments}
         if killed:
             remove_leftovers(self.domain, killed)

@@ -1,19 +1,31 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Removal of the shared memory that killed processes leave in a test run's domain."""
+"""Removal of the shared memory that killed processes leave in a test run's domain, and beyond."""
 
 from __future__ import annotations
 
 import re
+import sys
+import time
 from contextlib import suppress
 from pathlib import Path
 
 from relay_autotune.cli.own_nodes import free_domain, ports
 
-__all__ = ["free_domain", "mapped_segments", "remove_leftovers", "remove_unmapped"]
+__all__ = [
+    "free_domain",
+    "mapped_segments",
+    "release_unfinished",
+    "remove_leftovers",
+    "remove_unmapped",
+]
 
 SHARED_MEMORY = Path("/dev/shm")
+# A port is created, sized and made ready in one go, of which a busy machine may make seconds [s].
+_UNFINISHED_AFTER = 5.0
+# How its first word says that it is ready, and that it never will be.
+_READY, _CORRUPTED = 2, 3
 
 
 def mapped_segments(pid: int) -> set[Path]:
@@ -51,6 +63,25 @@ def remove_unmapped(segments: set[Path]) -> None:
     """
     for path in segments.difference(*map(mapped_segments, _processes())):
         _remove(path)
+
+
+def release_unfinished() -> None:
+    """Mark the ports as corrupted whose creator was killed before they were ready.
+
+    Whoever opens such a port waits for ever, and all domains share those from 7000 on: one process
+    that was ended in its start stopped every node of the machine. A marked one is made anew.
+    """
+    for path in SHARED_MEMORY.glob("fastrtps_port*[0-9]"):
+        with suppress(OSError):
+            if time.time() - path.stat().st_mtime < _UNFINISHED_AFTER:
+                continue
+            with path.open("r+b", buffering=0) as file:
+                word = file.read(4)
+                if not word:
+                    file.truncate(1)
+                elif len(word) == 4 and int.from_bytes(word, sys.byteorder) < _READY:
+                    file.seek(0)
+                    file.write(_CORRUPTED.to_bytes(4, sys.byteorder))
 
 
 def _processes() -> list[int]:
