@@ -24,6 +24,7 @@ from relay_autotune.experiment.faults import (
 )
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.known import Known
+from relay_autotune.loop.analysis import ms_on
 from relay_autotune.process.structures import UNSTABLE_FOPDT, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
@@ -150,8 +151,8 @@ def test_a_given_amplitude_beyond_the_ends_of_the_actuator_never_completes(
 @pytest.mark.parametrize("share", [0.1, 0.6, 0.2, 0.4])
 @pytest.mark.parametrize("std", [0.002, 0.02])
 @pytest.mark.parametrize("known", [Known(structure="fopdt"), Known()], ids=["fopdt", "chosen"])
-def test_both_levels_clipped_alike_within_the_limits_are_not_trusted(known, share, std):
-    """True Ms of its gains: 1.9 at six tenths of the amplitude, unstable at two tenths."""
+def test_of_both_levels_clipped_alike_only_gains_that_hold_are_trusted(known, share, std):
+    """True Ms of its gains: 1.8 to 1.9 at six tenths of the amplitude, unstable at two tenths."""
     limits = {"command_min": -5.0, "command_max": 5.0}
     tune = RelayExperiment(ExperimentParameters(amplitude=1.0, **limits), 0.0, from_small=True)
     plant, command, noise = FopdtPlant(1.65, 20.0, 10.0), 0.0, gaussian(std)
@@ -161,7 +162,11 @@ def test_both_levels_clipped_alike_within_the_limits_are_not_trusted(known, shar
         if tune.finished:
             break
     if tune.outcome is Outcome.COMPLETED:
-        assert analyse(tune.record(), known=known, alone=True).verdict is not Verdict.TRUSTED
+        found = analyse(tune.record(), known=known, alone=True)
+        # In the larger noise nothing tells six tenths of the effect from a smaller gain.
+        gains, process = found.best_gains, TransferFunction.fopdt(1.65, 20.0, 10.0)
+        hold = gains is not None and ms_on(gains, process) < 1.8
+        assert hold or found.verdict is not Verdict.TRUSTED
 
 
 def test_a_first_amplitude_that_cannot_leave_the_band_is_made_larger_soon():
