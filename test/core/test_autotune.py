@@ -210,6 +210,7 @@ def test_a_running_test_forgets_a_disturbance_of_its_beginning():
     assert found.ultimate_gain_std < 0.01 * found.ultimate_gain
 
 
+@pytest.mark.long
 def test_the_end_of_a_disturbed_record_remembers_what_drove_the_process_before():
     """A slow process still answers the commands of the cycles that are left out."""
     slow = TransferFunction.sopdt(1.0, (60.0, 3.0), 3.0)

@@ -8,6 +8,8 @@ import pytest
 
 from relay_autotune import DesignOptions, Record, analyse
 
+pytestmark = pytest.mark.long
+
 _GAIN, _LAGS, _DEAD_TIME = 1.1, (170.0, 38.0), 32.0
 
 
