@@ -11,6 +11,7 @@ from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.identification.judgement.assessment import assess
 from relay_autotune.identification.judgement.checks import unequal_amplitudes
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
@@ -134,3 +135,10 @@ def test_an_actuator_that_pulls_less_than_it_pushes_is_told():
     gains = [model.gain for model in found.draws]
     assert min(gains) < 0.7 * MODEL.gain
     assert max(gains) > 0.95 * MODEL.gain
+
+
+def test_the_same_relay_on_a_model_acts_unequally_as_the_record_does():
+    """The period of two equal effects is 8 % shorter, which spoke against the right model."""
+    record = _record(0.6)
+    (found,) = assess((identify_waveform(record, Known(structure="fopdt")),), record)
+    assert abs(found.validation.period) < 0.01

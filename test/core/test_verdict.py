@@ -88,5 +88,5 @@ def test_a_model_without_limit_cycle_is_said_in_words_and_a_start_away_from_rest
     assert said(none).startswith(told)
     assert "inf" not in said(none)
     assert said(none, away=True).startswith("the test did not begin at rest")
-    other = "the same relay on the model oscillates with another period, 0.250 off"
-    assert said(Validation(period=-0.25)) == other
+    other = "the same relay on the model oscillates with a period 25.0 % shorter than the recorded"
+    assert said(Validation(period=-0.25)) == f"{other} one"

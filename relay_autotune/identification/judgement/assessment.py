@@ -231,7 +231,7 @@ def assess(models: Sequence[Identification], record: Record) -> tuple[Identifica
         replace(
             found,
             fit=_fit(found, record, rest),
-            validation=_validated(found.model, seen, record),
+            validation=_validated(found, seen, record),
             integrated_error=_error_from(models[0], found),
         )
         for found in models
@@ -310,13 +310,31 @@ def _averaged(record: Record) -> Fold | None:
         return None
 
 
-def _validated(model: TransferFunction, seen: Fold | None, record: Record) -> Validation | None:
+def _validated(found: Identification, seen: Fold | None, record: Record) -> Validation | None:
     if seen is None:
         return None
     try:
-        return validate_fold(model, seen, steady_state(record, seen.settings))
+        rest = steady_state(record, seen.settings)
+        felt = _felt(seen.settings, found.effects, record.input().initial)
+        return validate_fold(found.model, replace(seen, settings=felt), rest)
     except IdentificationError as error:
         return Validation(reason=str(error))
+
+
+def _felt(settings: RelaySettings, effects: tuple[float, float], first: float) -> RelaySettings:
+    """Return the relay whose equal effects are those that a process feels of one.
+
+    :param settings: of the relay.
+    :param effects: of commands above and below the first one, relative to the model.
+    :param first: that command [u].
+    """
+    above, below = effects
+    low, high = (
+        first + (above if level > first else below) * (level - first)
+        for level in (settings.low, settings.high)
+    )
+    bias = 0.5 * (high + low) - settings.baseline
+    return replace(settings, amplitude=0.5 * (high - low), bias=bias)
 
 
 def _error_from(reference: Identification, found: Identification) -> float:

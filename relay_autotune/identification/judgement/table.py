@@ -63,7 +63,8 @@ def _limit_cycle(evidence: Evidence) -> Measured | None:
         # The same relay on the model alone moves without the friction.
         return None
     away = abs(validation.period)
-    said = f"oscillates with another period, {digits(away, 3)} off"
+    than = "longer" if validation.period > 0.0 else "shorter"
+    said = f"oscillates with a period {digits(100.0 * away, 3)} % {than} than the recorded one"
     if validation.reason:
         away, said = math.inf, f"does not oscillate as recorded: {validation.reason}"
     first = ""
