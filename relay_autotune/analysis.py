@@ -23,7 +23,7 @@ from relay_autotune.experiment.early_end import MS
 from relay_autotune.identification.judgement.assessment import assess, is_far_off
 from relay_autotune.identification.judgement.checks import unequal_amplitudes
 from relay_autotune.identification.judgement.disturbance import without_disturbance
-from relay_autotune.identification.judgement.evidence import Evidence
+from relay_autotune.identification.judgement.evidence import Difference, Evidence
 from relay_autotune.identification.judgement.table import MODEL_CHECKS
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods import (
@@ -44,7 +44,7 @@ from relay_autotune.record.thinning import thinned
 from relay_autotune.result import Analysis, Shaping
 from relay_autotune.text import digits
 from relay_autotune.tuning import DEFAULT_RULE, RULES, design, rule_named
-from relay_autotune.tuning.ensemble import ensemble, predicted_ms
+from relay_autotune.tuning.ensemble import DRAWS, ensemble, predicted_ms
 from relay_autotune.tuning.rules.formulas import describing_point_of_cycle
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import NOT_JUDGED, Finding, Judgement, Result, Verdict, judge
@@ -253,20 +253,27 @@ class _Tuning:
     rng: np.random.Generator | None = None
     tell: Tell = _quiet
 
-    def design_task(self, found: Analysis) -> DesignTask:
-        """Return what the rules are given for the selected model of an analysis."""
+    def design_task(self, found: Analysis, beside: Difference | None = None) -> DesignTask:
+        """Return what the rules are given for the selected model of an analysis.
+
+        :param beside: what the record shows beside the model; None: it was not asked.
+        """
         chosen = found.models[0]
         options = _with_noise(self.task.options, found)
-        models = ensemble(chosen, rng=self.rng or np.random.default_rng(0))
+        rng = self.rng or np.random.default_rng(0)
+        models = ensemble(chosen, rng=rng)
+        if beside is not None and not models:
+            models = (chosen.model,) * DRAWS
         unseen = _unseen(found.record, self.task.options)
         if unseen:
             options = replace(options, loop_delay=options.loop_delay + 0.5 * unseen)
-            models = _spread_in_time(models, unseen, self.rng or np.random.default_rng(0))
+            models = _spread_in_time(models, unseen, rng)
         return DesignTask(
             model=chosen.model,
             options=options,
             simple=self.simple,
             models=models,
+            errors=None if beside is None else beside.draws(len(models), rng),
             describing=_describing_point(found),
             recorded_period=_clock_of(found.record),
         )
@@ -376,7 +383,7 @@ def _judged(
     if judgement.verdict is Verdict.NONE:
         return _without_gains(found, judgement)
     tuning.tell("designing the gains")
-    shaping = Shaping(tuning.design_task(found), evidence, findings)
+    shaping = Shaping(tuning.design_task(found, evidence.difference), evidence, findings)
     found = replace(_warned_of_rows(found, tuning.task.options), shaping=shaping)
     tuned = _tuned(found, shaping.task, tuning.rules)
     gains = tuned.best_gains

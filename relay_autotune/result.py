@@ -12,6 +12,8 @@ import html
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.identification.judgement.evidence import Evidence, Loop
 from relay_autotune.identification.judgement.table import LOOP_CHECKS
@@ -58,12 +60,12 @@ class Shaping:
         """
         if self.evidence is None:
             return NOT_JUDGED
-        law = self.task.law(gains)
+        law, around = self.task.law(gains), self.task.around
         loop = Loop(
             controller=gains,
             ms_of=lambda models: ms_on_each(law, self.task.set_of(models)),
+            ms_around=np.empty(0) if around is None else ms_on_each(law, around),
             asked=max(self.task.options.ms, gains.ms),
-            added_delay=self.task.options.added_delay,
             pace_asked=self.task.options.given_closed_loop_time is not None,
         )
         found = judge(LOOP_CHECKS, self.evidence.with_loop(loop))

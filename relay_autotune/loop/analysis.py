@@ -45,7 +45,7 @@ from relay_autotune.loop.stability import (
     peaks,
     sampled_unstable_poles,
 )
-from relay_autotune.process.response import ModelSet
+from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 
 _POINTS = 4096

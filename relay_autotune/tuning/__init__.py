@@ -187,7 +187,7 @@ def judged(task: DesignTask, found: Designed) -> Gains:
             f"; in effect an integral controller, i = {controller.i:.4g} u/(y s): its ti is less "
             "than a sampling period, so that a program that takes kc and ti cannot hold it"
         )
-    if not task.models:
+    if task.around is None:
         reason += "; the uncertainty of the model is not known, so that Ms_95 is Ms"
         ms_95 = performance.ms
     else:

@@ -16,17 +16,17 @@ from relay_autotune.identification.result import Identification
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import ControlLaw
 from relay_autotune.loop.stability import at_infinity, winding
-from relay_autotune.process.response import ModelSet
+from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.candidates import allowed_outside
 from relay_autotune.tuning.rules import Rule
 from relay_autotune.tuning.task import DesignTask
 
-_MODELS = 100
+DRAWS = 100
 
 
 def ensemble(
-    identification: Identification, count: int = _MODELS, *, rng: np.random.Generator
+    identification: Identification, count: int = DRAWS, *, rng: np.random.Generator
 ) -> tuple[TransferFunction, ...]:
     """Return models within the uncertainty of an identification, of its direction.
 
@@ -67,7 +67,10 @@ def ms_on_each(law: ControlLaw, models: ModelSet) -> FloatArray:
     integrators = models.integrators + (1 if law.i else 0)
     count = winding(moved, w, models.unstable_poles, integrators, limits, law.period)
     for k in np.flatnonzero(np.isnan(count)):
-        count[k] = Loop(law, models.models[k]).unstable_poles
+        loop = Loop(law, models.models[k], models.of(int(k)))
+        # Of a continuous loop the argument principle knows the model alone.
+        known = models.errors is None or law.period > 0.0
+        count[k] = loop.unstable_poles if known else math.inf
     return np.where(count == 0.0, 1.0 / np.abs(moved[1:]).min(axis=0), math.inf)
 
 

@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 from relay_autotune.arrays import ComplexArray, FloatArray, IntArray
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import CONTINUOUS, LawRate, polynomial
-from relay_autotune.process.response import ModelSet
+from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import unstable_at_small_gain
 
@@ -138,20 +138,20 @@ class Responses:
 
     def __init__(
         self,
-        models: Sequence[TransferFunction],
+        models: ModelSet,
         grid: FloatArray,
         crossover: float,
         rate: LawRate = CONTINUOUS,
     ) -> None:
-        self._set = ModelSet(models, rate.period, rate.law.delay)
-        self._sign, self._rate = models[0].process_sign, rate
+        self._set = models.sampled(rate.period, rate.law.delay)
+        self._sign, self._rate = models.models[0].process_sign, rate
         self.count = len(models)
         self.crossover = crossover
         self._keep(grid, self._evaluate(grid))
-        self._poles = np.array([unstable_at_small_gain(m) for m in models])
+        self._poles = np.array([unstable_at_small_gain(m) for m in models.models])
         # The loops of these models reach -1 at w = 0 as the gain grows.
         self._at_rest = np.array(
-            [m.integrators == 0 and m.gain * m.process_sign < 0.0 for m in models]
+            [m.integrators == 0 and m.gain * m.process_sign < 0.0 for m in models.models]
         )
 
     def _evaluate(self, grid: FloatArray) -> ComplexArray:

@@ -84,11 +84,10 @@ def robust(task: DesignTask) -> tuple[Controller, str]:
 def _search(task: DesignTask) -> Search:
     """Return the search on the process in its loop."""
     options, model = task.options, task.held(task.model)
-    around = tuple(task.held(m) for m in task.models if m.process_sign == model.process_sign)
     noise = math.inf
     if options.noise_std > 0.0 and options.amplitude > 0.0 and options.sample_period > 0.0:
         noise = options.noise_share * options.amplitude / options.noise_std
-    return Search(model, around, options.filter_ratio, noise, options.rate)
+    return Search(model, task.around, options.filter_ratio, noise, options.rate)
 
 
 def _chosen(search: Search, bounds: Bounds) -> tuple[Controller, str]:

@@ -34,7 +34,7 @@ from relay_autotune.loop.analysis import Loop, abscissae, inverted
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import CONTINUOUS, LawRate, Slope
 from relay_autotune.loop.stability import peaks
-from relay_autotune.process.response import ModelSet
+from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning.candidates import Optimum, Surroundings, filters_of, stable_gains
@@ -128,8 +128,6 @@ _EXCESS_TOLERANCE, _ROUGH_TOLERANCE = 0.01, 0.03
 _MARGIN = 1.2
 # Integral gains have to be above the lower end of their range by this factor.
 _CLEAR = 1.02
-# Ratio of a model's dead time to the process's from which lower frequencies are looked at.
-_FAR_LATER = 3.0
 # A bound counts as kept up to this factor; frequencies are added to the grid at most so often.
 _HELD, _MOST_ADDED = 1.0 + 1e-4, 6
 _UNLIMITED = 0.1
@@ -150,7 +148,8 @@ class Search:
     Candidates hold kp' and td' of :mod:`~relay_autotune.tuning.frontier`.
 
     :param model: the process, with the dead time of the loop, but none for the hold.
-    :param models: models within its uncertainty; the bounds also hold on all but 5 % of them.
+    :param models: processes within its uncertainty, with the same dead time; the bounds also hold
+        on all but 5 % of them. None: it is not known.
     :param filter_ratio: largest td/tf.
     :param noise: largest standard deviation of the command per that of the noise in the samples
         [u/y]; infinite: no limit.
@@ -158,7 +157,7 @@ class Search:
     """
 
     model: TransferFunction
-    models: tuple[TransferFunction, ...] = ()
+    models: ModelSet | None = None
     filter_ratio: float = 10.0
     noise: float = math.inf
     rate: LawRate = CONTINUOUS
@@ -192,18 +191,15 @@ class Search:
     def responses(self) -> Responses:
         """Response of the process, at the frequencies where bounds are tested."""
         grid = design_grid(self.late, self.frequency, self.rate.period)
-        return Responses((self.model,), grid, self.frequency, self.rate)
+        return Responses(ModelSet((self.model,)), grid, self.frequency, self.rate)
 
     @cached_property
     def around(self) -> Surroundings | None:
         """The models within the uncertainty of the process."""
-        if not self.models:
+        if self.models is None:
             return None
-        # A loop with a model of a far longer dead time is closed at lower frequencies.
-        longest = max(m.dead_time for m in self.models)
-        later = min(1.0, _FAR_LATER * self.late.dead_time / longest) if longest > 0.0 else 1.0
         grid = self.responses.grid
-        few = np.unique(np.append(grid[grid > 0.03 * later * self.frequency][::2], grid[-1]))
+        few = np.append(grid[:-1:2], grid[-1])
         # Single precision is twice as fast and more than an ensemble needs.
         single = few.astype(np.float32)
         return Surroundings(Responses(self.models, single, self.frequency, self.rate))
@@ -234,7 +230,7 @@ class Search:
 
     def _among(self, around: Surroundings | None) -> Search:
         """Return this search with other models around the process; its responses are kept."""
-        search = replace(self, models=self.models if around else ())
+        search = replace(self, models=self.models if around else None)
         known = {"frequency": self.frequency, "responses": self.responses, "around": around}
         search.__dict__.update(known)
         return search

@@ -17,7 +17,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller, Performance
 from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate, SampledLaw, Slope
-from relay_autotune.process.response import ModelSet
+from relay_autotune.process.model_set import ModelErrors, ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.quantities import check, quantity
@@ -134,6 +134,7 @@ class DesignTask:
     :param options: what is asked for.
     :param simple: the FOPDT that fits best, for rules that need one; None: not known.
     :param models: models within the uncertainty; empty: the uncertainty is not known.
+    :param errors: what the process shows beside each of these; None: nothing.
     :param describing: K_u and w_u by the describing function from the limit cycle; None: not
         known.
     :param recorded_period: interval of the recording [s]; 0: there is none.
@@ -143,6 +144,7 @@ class DesignTask:
     options: DesignOptions = field(default_factory=DesignOptions)
     simple: TransferFunction | None = None
     models: tuple[TransferFunction, ...] = ()
+    errors: ModelErrors | None = None
     describing: UltimatePoint | None = None
     recorded_period: float = 0.0
 
@@ -174,18 +176,22 @@ class DesignTask:
         """
         return Loop(self.law(controller), self.held(self.model))
 
-    def set_of(self, models: Sequence[TransferFunction]) -> ModelSet:
-        """Return models as the loop meets them.
+    def set_of(
+        self, models: Sequence[TransferFunction], errors: ModelErrors | None = None
+    ) -> ModelSet:
+        """Return processes as the loop meets them.
 
         :param models: such as those within the uncertainty.
+        :param errors: what the processes show beside these; None: nothing.
         """
-        rate = self.options.rate
-        return ModelSet([self.held(model) for model in models], rate.period)
+        held = [self.held(model) for model in models]
+        errors = None if errors is None else errors.later(self.options.loop_delay)
+        return ModelSet(held, self.options.rate.period, errors=errors)
 
     @cached_property
-    def around(self) -> ModelSet:
-        """The models within the uncertainty, as the loop meets them."""
-        return self.set_of(self.models)
+    def around(self) -> ModelSet | None:
+        """The processes within the uncertainty, as the loop meets them; None: it is not known."""
+        return self.set_of(self.models, self.errors) if self.models else None
 
 
 def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:

@@ -21,7 +21,6 @@ from relay_autotune.errors import TuningError
 from relay_autotune.exchange.export import Target
 from relay_autotune.loop.analysis import Loop, abscissae, inverted
 from relay_autotune.loop.gains import Controller, Gains
-from relay_autotune.process.response import ModelSet
 from relay_autotune.quantities import Quantity, declared
 from relay_autotune.report.case import Case
 from relay_autotune.report.findings import performance_of
@@ -335,7 +334,7 @@ def _shaped(
     task = shaping.task
     loop, steady = task.loop(gains), np.empty(0, dtype=bool)
     unstable = 0
-    if task.models:
+    if task.around is not None:
         steady = np.isfinite(ms_on_each(loop.law, task.around))
         unstable = int(np.sum(~steady))
     return DesignResult(
@@ -362,11 +361,11 @@ def _steps(
     measurement[_POINTS // 2 :] += load * loaded.measurement[: _POINTS // 2]
     command[_POINTS // 2 :] += load * loaded.command[: _POINTS // 2]
     low = high = np.empty(0)
-    if np.any(steady):
+    if task.around is not None and np.any(steady):
         # All models at once, each with both steps in one transform.
         s = abscissae(duration, _POINTS)
         steps = (law.from_setpoint(s) + load * np.exp(-half * s)) / s
-        moving = ModelSet(task.around.models)(s).T[steady]
+        moving = task.around.sampled(0.0)(s).T[steady]
         runs = inverted(moving / (1.0 + law(s) * task.around(s).T[steady]) * steps, duration)
         low, high = np.quantile(runs, (0.025, 0.975), axis=0)
     return Steps(setpoint.time, measurement, command, low, high, load, half)
@@ -382,7 +381,7 @@ def _curve(gains: Gains, shaping: Shaping) -> LoopCurve:
     near = np.abs(values) < _FAR
     w, values = w[near], values[near]
     band: Sequence[FloatArray] = ()
-    if task.models and w.size > 2:
+    if task.around is not None and w.size > 2:
         some = w[:: max(1, w.size // _BAND)]
         around = loop.law(1j * some)[:, None] * task.around.at(some)
         band = swept_parts(around[np.all(np.abs(around) < _FAR, axis=1)].T)

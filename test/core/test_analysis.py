@@ -19,7 +19,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop, analyse_loop, is_stable
 from relay_autotune.loop.gains import Controller, InternalModelLaw
 from relay_autotune.loop.stability import closed_loop_unstable_poles, winding
-from relay_autotune.process.response import ModelSet
+from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.structures import (
     INTEGRATOR_INVERSE,
     IPDT,

@@ -16,6 +16,7 @@ from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS, LawRate
+from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.structures import INTEGRATOR_LAG, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import design, tune
@@ -167,7 +168,7 @@ def test_a_pole_that_is_unstable_below_the_grid_leaves_gains():
     law, period, kp = LAWS["simple_pid"], 0.2, 2.0
     model = TransferFunction(-2148.0, (), (-22540.0, 0.82), 0, 0.79)
     grid = np.geomspace(0.01, 0.99 * math.pi / period, 3000)
-    responses = Responses((model,), grid, 1.0, LawRate(law, period))
+    responses = Responses(ModelSet((model,)), grid, 1.0, LawRate(law, period))
     none = np.zeros(1)
     highs, _ = responses.largest_ki(Bounds(1.8), Candidates(np.array([kp]), none, none, none))
     ki = float(highs[0, 0])
@@ -185,6 +186,6 @@ def test_where_an_inverse_overflows_the_limits_are_right_and_nobody_is_warned():
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             tried = Candidates(kp, kp, 0.0 * kp, tf)
-            highs, _ = Responses((model,), grid, 1.0).largest_ki(Bounds(1.6), tried)
+            highs, _ = Responses(ModelSet((model,)), grid, 1.0).largest_ki(Bounds(1.6), tried)
         found.append(highs[0, 0])
     assert found[0] == pytest.approx(found[1], rel=1e-3)

@@ -240,7 +240,7 @@ def test_a_filter_is_not_so_slow_that_it_turns_the_loop_below_the_frequencies_lo
 
 def test_gains_that_no_filter_makes_quiet_enough_are_no_candidates():
     process = TransferFunction.fopdt(1.0, 10.0, 1.0)
-    search = Search(process, (), 10.0, 1e-6, LawRate(LAWS[OWN_LAW], 1.0))
+    search = Search(process, None, 10.0, 1e-6, LawRate(LAWS[OWN_LAW], 1.0))
     found = search._at(Bounds(1.4, 1.4), np.zeros((3, 2)))
     assert np.all(np.isinf(found.tf)) and np.all(found.ki == -math.inf)
 

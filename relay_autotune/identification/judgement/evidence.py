@@ -29,6 +29,7 @@ from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.residuals import Colour, colour_of
+from relay_autotune.process.model_set import ModelErrors
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.excitation import changes_within
@@ -45,7 +46,6 @@ _TURNS = 2
 # Shares below which a direction of the nuisances, and the square of one of the increments, are
 # those of rounding.
 _DEPENDENT, _ROUNDING = 1e-9, 1e-13
-_FREQUENCIES = 500
 
 
 @dataclass(frozen=True)
@@ -56,23 +56,23 @@ class Difference:
     :param mean: increments of its step response [y/u], shape (m,).
     :param root: of their covariance, shape (m, k).
     :param residual: rms of what neither model nor difference explain [y].
+    :param lowest: frequency of which the record shows one radian [rad/s].
     """
 
     edges: FloatArray
     mean: FloatArray
     root: FloatArray
     residual: float
+    lowest: float
 
-    def draws(self, frequency: FloatArray, count: int) -> ComplexArray:
-        """Return frequency responses drawn from its posterior [y/u], shape (count, k).
+    def draws(self, count: int, rng: np.random.Generator) -> ModelErrors:
+        """Return responses drawn from its posterior.
 
-        :param frequency: rad/s, shape (k,).
         :param count: how many.
+        :param rng: the source.
         """
-        normal = np.random.default_rng(0).standard_normal((count, self.root.shape[1]))
-        ends = np.exp(-1j * np.outer(self.edges, frequency))
-        bins = (ends[:-1] - ends[1:]) / np.outer(np.diff(self.edges), 1j * frequency)
-        return np.asarray((self.mean + normal @ self.root.T) @ bins)
+        normal = rng.standard_normal((count, self.root.shape[1]))
+        return ModelErrors(self.edges, self.mean + normal @ self.root.T, self.lowest)
 
 
 def difference(found: Identification, record: Record) -> Difference | None:
@@ -122,7 +122,8 @@ def difference(found: Identification, record: Record) -> Difference | None:
     alike = (1.0 + ratio) * np.exp(-ratio) + 1e-9 * np.eye(lag.size)
     prior = size[:, None] * np.linalg.cholesky(alike)
     shown = _posterior(left[known], nuisances[:, known], moved, prior)
-    return Difference(edges, shown.mean, shown.root, math.sqrt(float(np.mean(shown.left**2))))
+    residual = math.sqrt(float(np.mean(shown.left**2)))
+    return Difference(edges, shown.mean, shown.root, residual, 1.0 / record.duration)
 
 
 @dataclass(frozen=True)
@@ -224,48 +225,17 @@ class Loop:
 
     :param controller: -command per measurement at complex frequencies s [u/y].
     :param ms_of: Ms of the loops that these gains make with models; inf: unstable.
+    :param ms_around: the same with the processes that the record allows, each a model and what
+        the record shows beside it; empty: they are not known.
     :param asked: Ms that was asked of the gains, or theirs on the model where that is larger.
-    :param added_delay: dead time of the loop beside the process's own [s].
     :param pace_asked: True: how fast the loop is was asked for.
     """
 
     controller: Callable[[ComplexArray], ComplexArray]
     ms_of: Callable[[Sequence[TransferFunction]], FloatArray]
+    ms_around: FloatArray
     asked: float
-    added_delay: float = 0.0
     pace_asked: bool = False
-
-    def sensitivity(self, model: TransferFunction, w: FloatArray) -> ComplexArray:
-        """Return ``1/(1 + L)`` with a model.
-
-        :param model: any.
-        :param w: frequencies [rad/s], shape (k,).
-        """
-        process = model(1j * w) * np.exp(-1j * w * self.added_delay)
-        return np.asarray(1.0 / (1.0 + process * self.controller(1j * w)))
-
-    def ms_with(
-        self, models: Sequence[TransferFunction], w: FloatArray, differences: ComplexArray
-    ) -> FloatArray:
-        """Return Ms with models to each of which a stable difference is added; inf: unstable.
-
-        With S the sensitivity on a model and D its difference, that of the sum is
-        ``S/(1 + D C S)``. Where S is stable, the sum is if ``1 + D C S`` turns around zero as
-        often as not at all.
-
-        :param models: m of them.
-        :param w: rad/s, shape (k,).
-        :param differences: frequency responses [y/u], shape (m, k).
-        """
-        own = self.ms_of(models)
-        law = self.controller(1j * w) * np.exp(-1j * w * self.added_delay)
-        found = np.array([self.sensitivity(m, w) for m in models])
-        moved = 1.0 + differences * law * found
-        phase = np.unwrap(np.angle(np.column_stack((moved, np.ones(len(models))))), axis=1)
-        turns = np.abs(phase[:, -1] - phase[:, 0]) > math.pi
-        # Relative to the peak without it, since the law may be a sampled one.
-        rise = np.max(np.abs(found / moved), axis=1) / np.max(np.abs(found), axis=1)
-        return np.where(turns, math.inf, own * np.maximum(rise, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,12 +269,6 @@ class Evidence:
             return difference(self.found, self.record)
         except (ModelError, np.linalg.LinAlgError):
             return None
-
-    @property
-    def frequencies(self) -> FloatArray:
-        """Frequencies of which a record of this length and interval tells [rad/s]."""
-        lowest, highest = 0.5 / self.record.duration, 4.0 / self.record.mean_interval
-        return math.pi * np.geomspace(lowest, highest, _FREQUENCIES)
 
     @property
     def shown(self) -> float:

@@ -31,8 +31,6 @@ from relay_autotune.verdict import Check, Measured, not_known
 _FAR_ABOVE = 1.25
 # Frequency at which the integral action alone is left, times the record's duration [rad].
 _LOW = 1e-6
-# Least number of draws of a model and a difference.
-_DRAWN = 100
 # Share of bad ones from which gains are more likely bad than good.
 _LIKELY_BAD = 0.5
 # The same for a half of a record, which tells less: it has to contradict the gains.
@@ -79,19 +77,10 @@ def _growth(evidence: Evidence) -> Measured | None:
 
 
 def _risk(evidence: Evidence) -> Measured | None:
-    loop, found, difference = evidence.loop, evidence.found, evidence.difference
-    if loop is None:
+    loop = evidence.loop
+    if loop is None or not loop.ms_around.size:
         return None
-    models = found.draws or (found.model,)
-    if difference is not None:
-        w = evidence.frequencies
-        models = models * (_DRAWN // len(models) + 1)
-        ms = loop.ms_with(models, w, difference.draws(w, len(models)))
-    elif found.draws:
-        ms = loop.ms_of(models)
-    else:
-        return None
-    share = float(np.mean(ms > _FAR_ABOVE * loop.asked))
+    share = float(np.mean(loop.ms_around > _FAR_ABOVE * loop.asked))
     n = len(evidence.record)
     if share <= _LIKELY_BAD and n < LEAST_SAMPLES:
         return not_known(f"{n} samples show too little of the process; {LEAST_SAMPLES} are needed")

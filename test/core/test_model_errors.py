@@ -1,0 +1,80 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""Processes that are a model and a response beside it, compared with what they are the sum of."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from relay_autotune.loop.analysis import ms_on
+from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.laws import LAWS
+from relay_autotune.process.model_set import ModelErrors, ModelSet
+from relay_autotune.process.response import response
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import PiecewiseConstant
+from relay_autotune.tuning.ensemble import ms_on_each
+from relay_autotune.tuning.robust import robust
+from relay_autotune.tuning.task import DesignTask
+
+MODEL = TransferFunction.fopdt(1.0, 10.0, 3.0)
+TRUTH = TransferFunction.fopdt(1.6, 14.0, 4.0)
+STEP = PiecewiseConstant(np.zeros(1), np.ones(1), 0.0)
+# So low that they do not vanish within these tests.
+LOWEST = 1e-12
+
+
+def errors(count=1):
+    """Return the difference of the two processes, on lags that show it well."""
+    lags = np.concatenate((np.linspace(0.0, 30.0, 301), np.geomspace(30.0, 300.0, 200)[1:]))
+    beside = response(TRUTH, lags, STEP) - response(MODEL, lags, STEP)
+    return ModelErrors(lags, np.tile(np.diff(beside), (count, 1)), LOWEST)
+
+
+def test_a_model_and_its_error_are_the_process():
+    w = np.geomspace(1e-3, 3.0, 50)
+    found = ModelSet((MODEL,), errors=errors())(1j * w)[:, 0]
+    np.testing.assert_allclose(found, TRUTH(1j * w), atol=2e-3 * TRUTH.gain)
+
+
+@pytest.mark.parametrize(("period", "delay"), [(0.7, 0), (0.7, 2), (5.0, 1)])
+def test_held_errors_have_the_response_of_their_samples(period, delay):
+    beside = errors()
+    w = np.linspace(0.01, 0.95, 40) * math.pi / period
+    # The response to a held step, sample by sample, and its transform.
+    samples = np.arange(0.0, 320.0, period)
+    rises = np.concatenate(([0.0], np.cumsum(beside.rises[0])))
+    steps = np.diff(np.interp(samples, beside.lags, rises), prepend=0.0)
+    late = np.exp(-1j * np.outer(w, samples + delay * period))
+    found = beside.held(1j * w, period, delay)[:, 0]
+    np.testing.assert_allclose(found, late @ steps, atol=1e-6)
+
+
+def test_what_is_slower_than_the_record_is_left_to_the_model():
+    slow = ModelErrors(errors().lags, errors().rises, lowest=1e-3)
+    for period in (0.0, 1.0):
+        found = ModelSet((MODEL,), period, errors=slow)(np.array([1e-6j]))
+        assert abs(found[0, 0]) == pytest.approx(MODEL.gain, rel=1e-2)
+
+
+@pytest.mark.parametrize("period", [0.0, 0.5])
+@pytest.mark.parametrize(("kc", "stable"), [(1.5, True), (6.0, False)])
+def test_the_ms_with_an_error_is_that_of_the_process(period, kc, stable):
+    gains = Controller(kc, 12.0)
+    law = LAWS["pid_controller"].at(gains, period) if period else gains
+    (found,) = ms_on_each(law, ModelSet((MODEL,), period, errors=errors()))
+    (truth,) = ms_on_each(law, ModelSet((TRUTH,), period))
+    assert math.isfinite(truth) == stable
+    assert found == pytest.approx(truth, rel=5e-3)
+
+
+def test_the_design_holds_on_the_models_with_their_errors():
+    around = DesignTask(model=MODEL, models=(MODEL,) * 20, errors=errors(20))
+    gains, _ = robust(around)
+    assert ms_on(gains, TRUTH) == pytest.approx(1.4, rel=0.01)
+    # Without them it would not.
+    assert ms_on(robust(DesignTask(model=MODEL))[0], TRUTH) > 1.8
