@@ -126,7 +126,7 @@ class DesignOptions:
         return MT_INTEGRATING if model.integrators > 0 else MT_SELF_REGULATING
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class DesignTask:
     """A process for which a controller is to be designed.
 
