@@ -22,8 +22,13 @@ from relay_autotune.errors import IdentificationError, RelayAutotuneError, Tunin
 from relay_autotune.experiment.early_end import MS
 from relay_autotune.identification.judgement.assessment import assess, is_far_off
 from relay_autotune.identification.judgement.checks import unequal_amplitudes
+from relay_autotune.identification.judgement.difference import (
+    Difference,
+    difference,
+    widened,
+)
 from relay_autotune.identification.judgement.disturbance import without_disturbance
-from relay_autotune.identification.judgement.evidence import Difference, Evidence
+from relay_autotune.identification.judgement.evidence import Evidence
 from relay_autotune.identification.judgement.table import MODEL_CHECKS
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.methods import (
@@ -313,12 +318,8 @@ def _assessed(chosen: _Chosen, models: Sequence[Identification], tuning: _Tuning
     record = chosen.record
     tuning.tell("judging the model")
     found = Analysis(record, chosen.cycles, assess(models, record), 0)
-    evidence = Evidence(
-        record,
-        found.models[0],
-        settled=bool(chosen.cycles) and limit_cycle(chosen.cycles).converged,
-    )
-    return _judged(found, evidence, (record,), tuning)
+    settled = bool(chosen.cycles) and limit_cycle(chosen.cycles).converged
+    return _judged(found, (record,), tuning, settled=settled)
 
 
 def analyse_jointly(
@@ -362,9 +363,8 @@ def analyse_jointly(
     if told:
         chosen = replace(chosen, warnings=(*chosen.warnings, told))
     found = Analysis(first, cycles, assess((chosen,), first), 0)
-    evidence = Evidence(first, found.models[0])
     simple = _simple(records, known, chosen)
-    return _judged(found, evidence, records, _Tuning(task, _first(rule), simple, rng))
+    return _judged(found, records, _Tuning(task, _first(rule), simple, rng))
 
 
 def _nothing(record: Record, cycles: tuple[Cycle, ...], error: RelayAutotuneError) -> Analysis:
@@ -374,16 +374,21 @@ def _nothing(record: Record, cycles: tuple[Cycle, ...], error: RelayAutotuneErro
 
 
 def _judged(
-    found: Analysis, evidence: Evidence, records: Sequence[Record], tuning: _Tuning
+    found: Analysis, records: Sequence[Record], tuning: _Tuning, *, settled: bool = False
 ) -> Analysis:
     """Judge the model, add gains if they are allowed, and judge the gains."""
+    chosen, *others = found.models
+    beside = difference(chosen, found.record)
+    chosen = widened(chosen, beside)
+    found = replace(found, models=(chosen, *others))
+    evidence = Evidence(found.record, chosen, beside, settled)
     refused = next((_refusal(r) for r in records if r.outcome in _NO_GAINS), "")
     findings = judge(MODEL_CHECKS, evidence)
     judgement = Judgement(findings, refused=refused)
     if judgement.verdict is Verdict.NONE:
         return _without_gains(found, judgement)
     tuning.tell("designing the gains")
-    shaping = Shaping(tuning.design_task(found, evidence.difference), evidence, findings)
+    shaping = Shaping(tuning.design_task(found, beside), evidence, findings)
     found = replace(_warned_of_rows(found, tuning.task.options), shaping=shaping)
     tuned = _tuned(found, shaping.task, tuning.rules)
     gains = tuned.best_gains

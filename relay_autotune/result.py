@@ -68,7 +68,7 @@ class Shaping:
             asked=max(self.task.options.ms, gains.ms),
             pace_asked=self.task.options.given_closed_loop_time is not None,
         )
-        found = judge(LOOP_CHECKS, self.evidence.with_loop(loop))
+        found = judge(LOOP_CHECKS, replace(self.evidence, loop=loop))
         return Judgement((*self.findings, *found))
 
 

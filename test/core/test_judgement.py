@@ -21,7 +21,8 @@ from relay_autotune.identification.judgement.checks import (
     lost_effect,
     read_backward,
 )
-from relay_autotune.identification.judgement.evidence import Evidence, Loop, difference
+from relay_autotune.identification.judgement.difference import difference
+from relay_autotune.identification.judgement.evidence import Evidence, Loop
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
@@ -76,7 +77,7 @@ def finding(name, record, found, gains):
     models = (found.draws or (found.model,)) * 100
     around = ms_on_each(gains, ModelSet(models[:100], errors=errors))
     loop = Loop(gains, lambda ms: np.array([ms_on(gains, m) for m in ms]), around, gains.ms)
-    return next(iter(judge((check,), Evidence(record, found, loop=loop))), None)
+    return next(iter(judge((check,), Evidence(record, found, beside, loop=loop))), None)
 
 
 @pytest.fixture(scope="module")

@@ -6,16 +6,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.judgement.difference import Difference, widened
+from relay_autotune.identification.result import identified
 from relay_autotune.loop.analysis import ms_on
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.process.model_set import ModelErrors, ModelSet
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant
 from relay_autotune.tuning.ensemble import ms_on_each
 from relay_autotune.tuning.robust import robust
@@ -78,3 +83,24 @@ def test_the_design_holds_on_the_models_with_their_errors():
     assert ms_on(gains, TRUTH) == pytest.approx(1.4, rel=0.01)
     # Without them it would not.
     assert ms_on(robust(DesignTask(model=MODEL))[0], TRUTH) > 1.8
+
+
+def test_the_interval_of_the_ultimate_gain_holds_what_is_shown_beside_the_model():
+    beside = errors()
+    (rises,) = beside.rises
+    shown = Difference(beside.lags, rises, np.zeros((rises.size, 1)), 0.0, LOWEST)
+    found = replace(
+        identified("waveform", Estimate.of_model(MODEL), 2.0),
+        ultimate_gain_std=0.0,
+        ultimate_frequency_std=0.0,
+    )
+    wide, truth = widened(found, shown), ultimate_point(TRUTH)
+    assert truth is not None
+    gain = abs(math.log(truth.gain / found.ultimate_gain)) * found.ultimate_gain
+    assert wide.ultimate_gain_std == pytest.approx(gain, rel=0.01)
+    frequency = abs(math.log(truth.frequency / found.ultimate_frequency))
+    assert wide.ultimate_frequency_std == pytest.approx(
+        frequency * found.ultimate_frequency, rel=0.02
+    )
+    nothing = replace(shown, mean=np.zeros(rises.size))
+    assert widened(found, nothing).ultimate_gain_std < 1e-4 * found.ultimate_gain

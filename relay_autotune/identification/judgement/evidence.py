@@ -1,219 +1,22 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the checks look at: the record, the selected model, the models it allows, the gains.
-
-No structure is true. What a record shows of the process beside the model is estimated without any
-structure (a model-error model, Ljung 1999): the residual of the simulation is regressed on the
-past command,
-
-    e(t) = sum_j g_j v_j(t) + nuisances + noise,
-
-with v_j the mean of the command over a bin of lags, so that g_j is an increment of the step
-response of the difference, and the noise an autoregression. The increments have a normal prior
-about zero that decays with the lag; its size is the most likely one (stochastic embedding:
-Goodwin, Gevers and Ninness 1992), which is zero where noise alone explains the residual. So the
-difference has draws, as the model has, and each process that the record allows is a draw of both.
-"""
+"""What the checks look at: the record, the selected model, the models it allows, the gains."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
-from relay_autotune.errors import ModelError
+from relay_autotune.identification.judgement.difference import Difference
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.waveform.residuals import Colour, colour_of
-from relay_autotune.process.model_set import ModelErrors
-from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.excitation import changes_within
-from relay_autotune.record.record import PiecewiseConstant, Record
-
-_BINS = 48
-_MOST_COMPARED = 2000
-LEAST_SAMPLES = 60
-# Responses of the model in which the prior decays.
-_DECAY = 3.0
-# Ratios of the powers of difference and noise, of which the most likely one is taken.
-_RATIOS = np.concatenate(([0.0], np.geomspace(1e-3, 1e12, 61)))
-_TURNS = 2
-# Shares below which a direction of the nuisances, and the square of one of the increments, are
-# those of rounding.
-_DEPENDENT, _ROUNDING = 1e-9, 1e-13
-
-
-@dataclass(frozen=True)
-class Difference:
-    """The response that a record shows beside the model's, without a structure.
-
-    :param edges: of the bins of the lag [s], shape (m + 1,).
-    :param mean: increments of its step response [y/u], shape (m,).
-    :param root: of their covariance, shape (m, k).
-    :param residual: rms of what neither model nor difference explain [y].
-    :param lowest: frequency of which the record shows one radian [rad/s].
-    """
-
-    edges: FloatArray
-    mean: FloatArray
-    root: FloatArray
-    residual: float
-    lowest: float
-
-    def draws(self, count: int, rng: np.random.Generator) -> ModelErrors:
-        """Return responses drawn from its posterior.
-
-        :param count: how many.
-        :param rng: the source.
-        """
-        normal = rng.standard_normal((count, self.root.shape[1]))
-        return ModelErrors(self.edges, self.mean + normal @ self.root.T, self.lowest)
-
-
-def difference(found: Identification, record: Record) -> Difference | None:
-    """Return the response that a record shows beside a model's; None where it cannot tell.
-
-    :param found: the model, and what was estimated with it: of that the two effects of the
-        command count, and the rest has a size of its own.
-    :param record: the record.
-    """
-    model = found.model
-    if model.grows or len(record) < LEAST_SAMPLES:
-        return None
-    u = record.input()
-    few = np.unique(np.linspace(0, len(record) - 1, _MOST_COMPARED).astype(np.int64))
-    time = record.time[few]
-    away = u.values - u.initial
-    above, below = found.effects
-    acting = replace(u, values=u.initial + np.where(away > 0.0, above, below) * away)
-    answer = response(model, time, acting)
-    # The measurement's zero and the command before the record are not known.
-    before = response(model, time, PiecewiseConstant(time[:1], np.ones(1), 0.0))
-    beside = [np.ones(time.size), before]
-    if len(found.fitted) == len(record):
-        beside.append(found.fitted[few] - answer)
-    left, nuisances = record.measurement[few] - answer, np.stack(beside)
-    known = np.isfinite(nuisances).all(axis=0)
-    if np.count_nonzero(known) < LEAST_SAMPLES:
-        return None
-    # No bin is narrower than the time between samples, which tell nothing of what is within it.
-    shortest = max(float(np.median(np.diff(time))), 1e-6 * record.duration)
-    widths = np.geomspace(1.0, record.duration / shortest, _BINS)
-    edges = shortest * np.concatenate(([0.0], np.unique(np.round(widths))))
-    past = _integral(u, time[known, None] - edges)
-    moved = ((past[:, :-1] - past[:, 1:]) / np.diff(edges)).T
-    if not np.any(moved):
-        return None
-    whole = model.dead_time + sum(abs(t) for t in model.time_constants) or record.duration
-    # Of what is faster than the samples they tell nothing.
-    whole = max(whole, shortest)
-    lag = np.sqrt(np.maximum(edges[:-1], 0.5 * shortest) * edges[1:])
-    # An impulse response without jumps has increments as its bins are wide, which is as their lag,
-    # and alike where the lags are (a kernel of correlated decay, Chen, Ohlsson and Ljung 2012; in
-    # the form of Matern, since the response to what lies between two frequencies of the command
-    # differs little from that to both).
-    size = lag / whole * np.exp(-lag / (_DECAY * whole))
-    ratio = math.sqrt(3.0) * np.abs(np.subtract.outer(np.log(lag), np.log(lag)))
-    alike = (1.0 + ratio) * np.exp(-ratio) + 1e-9 * np.eye(lag.size)
-    prior = size[:, None] * np.linalg.cholesky(alike)
-    shown = _posterior(left[known], nuisances[:, known], moved, prior)
-    residual = math.sqrt(float(np.mean(shown.left**2)))
-    return Difference(edges, shown.mean, shown.root, residual, 1.0 / record.duration)
-
-
-@dataclass(frozen=True)
-class _Posterior:
-    """Increments of the difference in noise of one colour.
-
-    :param mean: of the increments, shape (m,).
-    :param root: of their covariance, shape (m, k).
-    :param left: what they and the nuisances leave [y], shape (n,).
-    :param unlikely: BIC of the samples with the most likely size of the prior.
-    """
-
-    mean: FloatArray
-    root: FloatArray
-    left: FloatArray
-    unlikely: float
-
-
-def _posterior(
-    left: FloatArray, nuisances: FloatArray, moved: FloatArray, prior: FloatArray
-) -> _Posterior:
-    """Return the posterior of increments in the most likely colour of the noise.
-
-    Noise and difference are estimated in turn (Cochrane and Orcutt 1949), once from noise that
-    explains all and once from a difference that does.
-
-    :param left: residual of the simulation [y], shape (n,).
-    :param nuisances: curves of any size, shape (p, n).
-    :param moved: responses to an increment each, shape (m, n).
-    :param prior: root of their relative covariance, shape (m, m).
-    """
-    basis = np.linalg.svd(nuisances, full_matrices=False)[2]
-    found = []
-    for colour in (colour_of([left - (left @ basis.T) @ basis]), None):
-        for _ in range(_TURNS):
-            found.append(_in_colour(colour, left, nuisances, moved, prior))
-            colour = colour_of([found[-1].left])
-    return min(found, key=lambda f: f.unlikely)
-
-
-def _in_colour(
-    colour: Colour | None,
-    left: FloatArray,
-    nuisances: FloatArray,
-    moved: FloatArray,
-    prior: FloatArray,
-) -> _Posterior:
-    def white(x: FloatArray) -> FloatArray:
-        return x if colour is None else colour.whitened(x)
-
-    aside = white(nuisances)
-    _, values, shapes = np.linalg.svd(aside, full_matrices=False)
-    basis = shapes[values > _DEPENDENT * values[0]]
-
-    def beside(x: FloatArray) -> FloatArray:
-        return x - (x @ basis.T) @ basis
-
-    free = beside(white(left))
-    rows, n = beside(white(prior.T @ moved)), free.size
-    squares, axes = np.linalg.eigh(rows @ rows.T)
-    known = squares > _ROUNDING * squares[-1]
-    axes, values = axes[:, known], np.sqrt(squares[known])
-    along = (axes.T @ (rows @ free)) / values
-    # Powers of the difference over those of the noise.
-    power = np.outer(_RATIOS, (values / values[-1]) ** 2)
-    total = float(free @ free) - np.sum(along**2 * power / (1.0 + power), axis=1)
-    noise = np.maximum(total, _ROUNDING * float(free @ free)) / n
-    unlikely = n * np.log(noise) + np.sum(np.log1p(power), axis=1)
-    k = int(np.argmin(unlikely))
-    size = math.sqrt(_RATIOS[k]) / values[-1]
-    reached = size**2 * values / (1.0 + power[k])
-    turned = prior @ axes
-    mean = turned @ (reached * along)
-    root = turned * (size * np.sqrt(noise[k] / (1.0 + power[k])))
-    rest = left - mean @ moved
-    rest = rest - np.linalg.lstsq(aside.T, white(rest), rcond=None)[0] @ nuisances
-    cost = 0.0 if colour is None else colour.log_determinant + colour.order * math.log(n)
-    return _Posterior(mean, root, rest, float(unlikely[k]) + cost)
-
-
-def _integral(u: PiecewiseConstant, at: FloatArray) -> FloatArray:
-    """Return the integral of the command's deviation from its first value up to given times."""
-    if u.times.size == 0:
-        return np.zeros(at.shape)
-    away = u.values - u.initial
-    before = np.concatenate(([0.0], np.cumsum(away[:-1] * np.diff(u.times))))
-    k = np.searchsorted(u.times, at, side="right") - 1
-    value = before[k] + away[k] * (at - u.times[k])
-    return np.where(k >= 0, value, 0.0)
-
+from relay_autotune.record.record import Record
 
 # Number of time constants within which an unstable process leaves any rest.
 MOST_GROWTH = 7.0
@@ -244,31 +47,16 @@ class Evidence:
 
     :param record: the samples.
     :param found: the selected model, with its uncertainty, its fit and its limit cycle.
+    :param difference: what the record shows beside the model; None: it cannot tell.
     :param settled: True if the record has a limit cycle whose last cycles agree.
     :param loop: the gains; None: there are none yet.
     """
 
     record: Record
     found: Identification
+    difference: Difference | None = None
     settled: bool = False
     loop: Loop | None = None
-
-    def with_loop(self, loop: Loop) -> Evidence:
-        """Return the same experiment with some gains, and what was computed without them.
-
-        :param loop: the gains.
-        """
-        found = replace(self, loop=loop)
-        found.__dict__["difference"] = self.difference
-        return found
-
-    @cached_property
-    def difference(self) -> Difference | None:
-        """What the record shows beside the model; None where it cannot tell."""
-        try:
-            return difference(self.found, self.record)
-        except (ModelError, np.linalg.LinAlgError):
-            return None
 
     @property
     def shown(self) -> float:

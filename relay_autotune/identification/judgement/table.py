@@ -19,11 +19,8 @@ from relay_autotune.identification.judgement.checks import (
     lost_effect,
     read_backward,
 )
-from relay_autotune.identification.judgement.evidence import (
-    LEAST_SAMPLES,
-    MOST_GROWTH,
-    Evidence,
-)
+from relay_autotune.identification.judgement.difference import LEAST_SAMPLES
+from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence
 from relay_autotune.text import digits
 from relay_autotune.verdict import Check, Measured, not_known
 
