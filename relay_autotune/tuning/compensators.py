@@ -27,10 +27,7 @@ from dataclasses import dataclass
 
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import InternalModelLaw
-from relay_autotune.loop.laws import Rational, Running
-from relay_autotune.loop.sampled import Limits, require_period
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.virtual_process import Plant
 from relay_autotune.tuning.rules.formulas import fopdt_of, named, process_of
 from relay_autotune.tuning.task import DesignTask
 
@@ -73,7 +70,7 @@ class Compensator:
         if self.model.dead_time > 0.0:
             raise TuningError(
                 "a controller with a dead time inside is no rational function of s; found "
-                f"{self.model.dead_time:g} s: use its law, or run it sampled"
+                f"{self.model.dead_time:g} s: use its law"
             )
         n = len(self.model.time_constants)
         slow = self.closed_loop_time
@@ -81,69 +78,6 @@ class Compensator:
         return TransferFunction(
             1.0 / (self.model.gain * n * slow), self.model.time_constants, lags, 1
         )
-
-
-class SampledCompensator:
-    """A compensator that is called once for each sample.
-
-    The model inside moves exactly between the commands, which it sees as they were limited, so
-    that nothing winds up. Each section ``(tau s + 1)/(lambda s + 1)`` of the filter is exact for
-    an input that runs straight from one sample to the next.
-
-    :param compensator: the controller.
-    :param period: of the samples [s].
-    :param low: least command [u].
-    :param high: largest command [u].
-    :param offset: command at which the process rests at the set-point [u].
-    :raises TuningError: if the period is not positive or the limits leave no range.
-    """
-
-    def __init__(
-        self,
-        compensator: Compensator,
-        period: float,
-        *,
-        low: float = -math.inf,
-        high: float = math.inf,
-        offset: float = 0.0,
-    ) -> None:
-        require_period(period)
-        self.period = period
-        self._limits, self._offset = Limits(low, high), offset
-        self._gain = compensator.model.gain
-        slow = compensator.closed_loop_time
-        self._sections = [
-            _section(tau.real, slow, period) for tau in compensator.model.time_constants
-        ]
-        self._inside = Plant(compensator.model)
-        self._command, self._count = 0.0, 0
-
-    def step(self, setpoint: float, measurement: float) -> float:
-        """Return the command for this sample [u].
-
-        :param setpoint: y.
-        :param measurement: y.
-        """
-        expected = self._inside.advance(self._count * self.period, self._command)
-        signal = setpoint - measurement + expected
-        for section in self._sections:
-            signal = section.step(signal)
-        wanted = self._offset + signal / self._gain
-        given = self._limits.clip(wanted)
-        self._command = given - self._offset
-        self._count += 1
-        return given
-
-
-def _section(tau: float, slow: float, period: float) -> Running:
-    """Return (tau s + 1)/(lambda s + 1), exact for an input that runs straight between samples."""
-    ratio = period / slow
-    # Weights of the present and the last input in the lag's output.
-    decay, present = math.exp(-ratio), 1.0 + math.expm1(-ratio) / ratio
-    past, through = 1.0 - decay - present, tau / slow
-    rest = 1.0 - through
-    top = through + rest * present, rest * past - through * decay
-    return Running(Rational(top, (1.0, -decay)))
 
 
 def dead_time_compensator(task: DesignTask) -> Compensator:
