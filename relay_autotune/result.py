@@ -63,7 +63,6 @@ class Shaping:
         law, around = self.task.law(gains), self.task.around
         loop = Loop(
             controller=gains,
-            ms_of=lambda models: ms_on_each(law, self.task.set_of(models)),
             ms_around=np.empty(0) if around is None else ms_on_each(law, around),
             asked=max(self.task.options.ms, gains.ms),
             pace_asked=self.task.options.given_closed_loop_time is not None,

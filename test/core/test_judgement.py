@@ -76,7 +76,7 @@ def finding(name, record, found, gains):
     errors = None if beside is None else beside.draws(100, np.random.default_rng(0))
     models = (found.draws or (found.model,)) * 100
     around = ms_on_each(gains, ModelSet(models[:100], errors=errors))
-    loop = Loop(gains, lambda ms: np.array([ms_on(gains, m) for m in ms]), around, gains.ms)
+    loop = Loop(gains, around, gains.ms)
     return next(iter(judge((check,), Evidence(record, found, beside, loop=loop))), None)
 
 
@@ -242,16 +242,13 @@ def test_halves_that_differ_as_much_as_their_noise_are_not_told(dead_time):
     assert not any("differ 1 times" in text for text in found.warnings)
 
 
-def test_gains_that_do_not_hold_on_one_half_are_doubtful(record, gains):
-    found = identified(record)
-    other = TransferFunction.fopdt(20.0, 10.0, 3.0)
-    late = (other,) * 37 + (PROCESS,) * 3
-    halves = (Part(0.0, 100.0, (PROCESS,) * 40), Part(100.0, 200.0, late))
-    said = finding("halves", record, replace(found, halves=halves), gains)
-    assert said.result is Result.DOUBTFUL
-    assert "100 s to 200 s" in said.sentence
-    assert finding("halves", record, replace(found, halves=halves[:1]), gains).value == 0.0
-    assert finding("halves", record, replace(found, halves=()), gains) is None
+def test_gains_hold_on_both_halves_of_a_process_that_changed():
+    other = TransferFunction.fopdt(2.0, 10.0, 5.0)
+    gains = analyse(joined(PROCESS, other), known=Known(structure="fopdt"), alone=True).best_gains
+    assert max(ms_on(gains, PROCESS), ms_on(gains, other)) < 1.5
+    # Those for the first half alone would not.
+    alone = analyse(steps(PROCESS), known=Known(structure="fopdt"), alone=True).best_gains
+    assert ms_on(alone, other) > 1.7
 
 
 @pytest.mark.parametrize(
@@ -271,7 +268,6 @@ def test_a_half_that_shows_nothing_objects_to_nothing():
     noisy = replace(record, measurement=record.measurement + np.where(record.time < 260, noise, 0))
     found = analyse(noisy, known=Known(structure="fopdt"), alone=True)
     findings_of = {f.name: f for f in found.judgement.findings}
-    assert findings_of["halves"].result is Result.PASSED
     assert findings_of["direction"].result is Result.PASSED
 
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,15 +27,13 @@ class Loop:
     """The gains that are to be judged, as far as checks need them.
 
     :param controller: -command per measurement at complex frequencies s [u/y].
-    :param ms_of: Ms of the loops that these gains make with models; inf: unstable.
-    :param ms_around: the same with the processes that the record allows, each a model and what
-        the record shows beside it; empty: they are not known.
+    :param ms_around: Ms with the processes that the record allows, each a model and what the
+        record shows beside it; inf: unstable; empty: they are not known.
     :param asked: Ms that was asked of the gains, or theirs on the model where that is larger.
     :param pace_asked: True: how fast the loop is was asked for.
     """
 
     controller: Callable[[ComplexArray], ComplexArray]
-    ms_of: Callable[[Sequence[TransferFunction]], FloatArray]
     ms_around: FloatArray
     asked: float
     pace_asked: bool = False

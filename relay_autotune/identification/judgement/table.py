@@ -30,8 +30,6 @@ _FAR_ABOVE = 1.25
 _LOW = 1e-6
 # Share of bad ones from which gains are more likely bad than good.
 _LIKELY_BAD = 0.5
-# The same for a half of a record, which tells less: it has to contradict the gains.
-_IN_HALF = 2.0
 
 
 def _fed_back(evidence: Evidence) -> Measured | None:
@@ -103,16 +101,6 @@ def _beyond(evidence: Evidence) -> Measured | None:
     s = np.array([1j / shown])
     gain = float(abs(evidence.found.model(s) * loop.controller(s))[0])
     return Measured(1.0 / gain) if gain > 0.0 else None
-
-
-def _halves(evidence: Evidence) -> Measured | None:
-    loop, halves = evidence.loop, evidence.found.halves
-    if loop is None or not halves:
-        return None
-    # A half that tells little has models all around that of the whole, and excludes nothing.
-    bad = [float(np.mean(loop.ms_of(p.models) > _IN_HALF * loop.asked)) for p in halves]
-    found = [(b * p.contradicts, p.span) for b, p in zip(bad, halves, strict=True)]
-    return Measured(*max(found))
 
 
 def _direction(evidence: Evidence) -> Measured | None:
@@ -271,18 +259,6 @@ LOOP_CHECKS = (
         "so",
         remedy="run more cycles, use a larger amplitude, or record a longer test",
         measure=_risk,
-    ),
-    Check(
-        name="halves",
-        title="Halves",
-        what="share of the models that one half of the record allows on which the gains are "
-        "unstable or have an Ms of more than twice what was asked",
-        unit="",
-        doubtful=0.9,
-        sentence="{detail} of the record alone shows another process: on {value} of its models "
-        "the loop is unstable or nearly so",
-        remedy="see whether load, operating point or other inputs changed, and record again",
-        measure=_halves,
     ),
     Check(
         name="beyond",
