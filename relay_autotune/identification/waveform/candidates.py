@@ -26,7 +26,7 @@ from relay_autotune.identification.waveform.separable import (
     Trial,
     evaluate,
     information_criterion,
-    left_beside,
+    left_in_simulation,
     left_of,
     pulse,
     refine,
@@ -194,8 +194,8 @@ class FitContext:
         A zero, and an integrator beside a drift, follow a slow disturbance with a gain of either
         sign.
         """
-        left, total = left_beside(self.problem, self.fopdt)
-        if float(left @ left) > _NEARLY_ALL * float(total @ total):
+        left, total = left_in_simulation(self.problem, self.fopdt)
+        if left**2 > _NEARLY_ALL * total**2:
             return 0
         return 1 if self.fopdt.coefficients[0] > 0.0 else -1
 

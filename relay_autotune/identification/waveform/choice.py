@@ -36,7 +36,7 @@ from relay_autotune.identification.waveform.separable import (
     Problem,
     Trial,
     information_criterion,
-    left_beside,
+    left_in_simulation,
     left_of,
     refine,
 )
@@ -328,8 +328,8 @@ def _simulates(candidate: Candidate, least: float) -> bool:
     :param candidate: fitted in a colour.
     :param least: mean square that the best simulation leaves.
     """
-    left, _ = left_beside(replace(candidate.problem, colour=None), candidate.state)
-    return float(np.mean(left**2)) <= _WORSE * least
+    left, _ = left_in_simulation(candidate.problem, candidate.state)
+    return left**2 <= _WORSE * least
 
 
 def _by_rank(found: list[Candidate]) -> Iterable[Candidate]:

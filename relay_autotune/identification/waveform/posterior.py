@@ -31,7 +31,7 @@ from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Problem,
     Trial,
-    left_beside,
+    left_in_simulation,
     refine,
 )
 from relay_autotune.process.structures import Structure
@@ -106,7 +106,7 @@ def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: fl
     for candidate, share in zip(fit.candidates[1:], shares[1:], strict=True):
         problem, state = candidate.problem, candidate.state
         count = round(DRAWS * share)
-        if count and _left(problem, state)[0] <= most:
+        if count and left_in_simulation(problem, state)[0] <= most:
             drawn = _draws(problem, state, fit.scale, inflation * temper, count, rng).models
             mixture += drawn
             models += _on_both_sides(drawn, problem, state)
@@ -149,16 +149,9 @@ def _plain(fit: Fit) -> list[TransferFunction]:
     return found
 
 
-def _left(problem: Problem, state: Trial) -> tuple[float, float]:
-    """Return the rms that a model leaves in simulation, and that of what is to be explained."""
-    parts = left_beside(replace(problem, colour=None), state)
-    left, total = (math.sqrt(float(np.mean(part**2))) for part in parts)
-    return left, total
-
-
 def _most_left(fit: Fit) -> float:
     """Return the largest rms of a model that simulates a record as well as the chosen one."""
-    left, total = _left(fit.problem, fit.state)
+    left, total = left_in_simulation(fit.problem, fit.state)
     return left + _AS_WELL * total
 
 

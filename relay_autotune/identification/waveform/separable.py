@@ -427,19 +427,19 @@ def left_of(y: FloatArray, rows: FloatArray) -> FloatArray:
     return np.asarray(y - np.linalg.lstsq(rows.T, y, rcond=None)[0] @ rows)
 
 
-def left_beside(problem: Problem, state: Trial) -> tuple[FloatArray, FloatArray]:
-    """Return what a model leaves of a problem's samples, and what of them is to be explained.
+def left_in_simulation(problem: Problem, state: Trial) -> tuple[float, float]:
+    """Return the rms that a model leaves in simulation, and that of what it is to explain.
 
     Offset, drift and past are fitted anew; the model keeps its own coefficients.
 
     :param problem: may hold other samples than those that the model was fitted to.
     :param state: the model.
-    :return: each of shape (n,).
     """
-    own = len(problem.structure.powers)
+    problem, own = replace(problem, colour=None), len(problem.structure.powers)
     columns, y = problem.seen(problem.columns(state.theta)[0]), problem.seen(problem.y)
     response = state.coefficients[:own] @ columns[:own]
-    return left_of(y - response, columns[own:]), left_of(y, columns[own:])
+    left, total = left_of(y - response, columns[own:]), left_of(y, columns[own:])
+    return math.sqrt(float(np.mean(left**2))), math.sqrt(float(np.mean(total**2)))
 
 
 def _backward(r: list[list[float]], right: list[float]) -> FloatArray:
