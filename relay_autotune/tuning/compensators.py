@@ -20,8 +20,6 @@ known to 10 %, lambda must not be only a few percent of it.
 
 from __future__ import annotations
 
-import cmath
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -59,25 +57,6 @@ class Compensator:
         fast = (complex(self.closed_loop_time),) * len(lags)
         q = TransferFunction(1.0 / self.model.gain, lags, fast)
         return InternalModelLaw(q, TransferFunction(1.0, (), fast, 0, self.model.dead_time))
-
-    def transfer_function(self) -> TransferFunction:
-        """Return the controller from error to command, where the model has no dead time (eq 54).
-
-        ``(lambda s + 1)^n - 1`` has the roots ``(e^{2 pi j k/n} - 1)/lambda``, k = 0 to n - 1.
-
-        :raises TuningError: if the model has a dead time: the controller is not rational then.
-        """
-        if self.model.dead_time > 0.0:
-            raise TuningError(
-                "a controller with a dead time inside is no rational function of s; found "
-                f"{self.model.dead_time:g} s: use its law"
-            )
-        n = len(self.model.time_constants)
-        slow = self.closed_loop_time
-        lags = tuple(_clean(slow / (1.0 - cmath.exp(2j * math.pi * k / n))) for k in range(1, n))
-        return TransferFunction(
-            1.0 / (self.model.gain * n * slow), self.model.time_constants, lags, 1
-        )
 
 
 def dead_time_compensator(task: DesignTask) -> Compensator:
@@ -126,8 +105,3 @@ def _lambda(task: DesignTask, default: float, why: str) -> tuple[float, str]:
     if given is None:
         return default, f"{why} = {default:.4g} s"
     return given, f"{given:.4g} s, as given"
-
-
-def _clean(value: complex) -> complex:
-    """Remove an imaginary part due to rounding; conjugates must match to the last digit."""
-    return complex(value.real) if abs(value.imag) < 1e-12 * abs(value) else value

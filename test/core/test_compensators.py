@@ -30,8 +30,6 @@ def test_eq_50():
     assert found.closed_loop_time == 2.0 * tau
     law = (tau * S + 1.0) / (k * (2.0 * tau * S + 1.0 - np.exp(-d * S)))
     np.testing.assert_allclose(found.law(S), law, rtol=1e-12)
-    with pytest.raises(TuningError, match="no rational function"):
-        found.transfer_function()
 
 
 def test_eq_54():
@@ -41,14 +39,12 @@ def test_eq_54():
     bracket = slow**4 / 5.0 * S**4 + slow**3 * S**3 + 2.0 * slow**2 * S**2 + 2.0 * slow * S + 1.0
     law = (tau * S + 1.0) ** 5 / (5.0 * k * slow * S * bracket)
     np.testing.assert_allclose(found.law(S), law, rtol=1e-9)
-    np.testing.assert_allclose(found.transfer_function()(S), law, rtol=1e-9)
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 7, 12])
 def test_eq_54_for_any_order(n):
     found = high_order_compensator(task(TransferFunction.lag_n(-2.0, 3.0, n, 0.0)))
     law = (3.0 * S + 1.0) ** n / (-2.0 * ((1.35 * S + 1.0) ** n - 1.0))
-    np.testing.assert_allclose(found.transfer_function()(S), law, rtol=1e-8)
     np.testing.assert_allclose(found.law(S), law, rtol=1e-8)
 
 
