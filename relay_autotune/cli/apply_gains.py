@@ -187,11 +187,12 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
     if step and tried is not None:
         with Working("computing which steps the limits allow"):
             allowed = client.allowed_steps(tried)
-        step = options.step or allowed.nearest(step)
-        allowed.require(step)
+            step = options.step or allowed.nearest(step)
+            allowed.require(step)
+            expected = "" if options.load else client.expected(tried, step)
     question = _question(options, step)
     if step and tried is not None and not options.yes:
-        agreed = bool(step := agreed_step(question, step, allowed))
+        agreed = bool(step := agreed_step(f"{question} {expected}".strip(), step, allowed))
     else:
         agreed = agrees(question, yes=options.yes)
     if not agreed:

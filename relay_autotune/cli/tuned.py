@@ -28,7 +28,7 @@ from relay_autotune.cli.own_nodes import (
 from relay_autotune.cli.terminal import UNITS, WIDEST, Working
 from relay_autotune.cli.tune_view import Paint, result_lines
 from relay_autotune.control.controller import Control
-from relay_autotune.control.verification import Step, allowed_steps, noise_of, plan, proving_step
+from relay_autotune.control.verification import StepChoice, noise_of
 from relay_autotune.errors import TuningError
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
 from relay_autotune.loop.gains import Gains
@@ -135,40 +135,36 @@ class Proof:
     """
 
     def __init__(self, tune: Tuned, message: Any = None) -> None:
-        result, record = tune.result, tune.record
+        result, record, options = tune.result, tune.record, tune.options
         self._loop, self._message = tune.loop, message or result.gains
-        options, gains = tune.options, gains_from_message(self._message)
-        model = transfer_function_from_message(result.transfer_function)
         assert record.settings is not None, "gains come of a whole experiment"
         self._rest = rest = record.settings
         self._within = Limits(*options.within)
         # Without limits the process has seen the levels of the relay.
         self._commands = Limits(*(options.command_within or (rest.low, rest.high)))
-        limits = self._within, self._commands
-        self.noise_std = noise = noise_of(record.noise_std, result.transfer_function.residual_rms)
-        step = options.step or proving_step(record, model, *limits, noise)
-        if not step:
+        self.noise_std = noise_of(record.noise_std, result.transfer_function.residual_rms)
+        model = transfer_function_from_message(result.transfer_function)
+        choice = StepChoice(record, model, self._within, self._commands, self.noise_std)
+        if not (step := options.step or choice.best):
             raise TuningError("the limits leave no room for a step: widen --within")
+        gains = gains_from_message(self._message)
         self.rate = rate_of(gains.law, gains.law_period)
-        control, period = Control(gains, self.rate), record.mean_interval
-        once = plan(control, model, Step(setpoint=1.0), period)
-        self.allowed = allowed_steps(record, model, *limits, once, noise)
+        control = Control(gains, self.rate)
+        self.allowed = choice.allowed(choice.plan(control, 1.0))
         self.step: float = options.step or self.allowed.nearest(step)
         self.allowed.require(self.step)
-        wanted = plan(control, model, Step(setpoint=self.step), period)
+        wanted = choice.plan(control, self.step)
         # How long the loop takes to settle with the gains, and all of it [s].
         known = math.isfinite(gains.settling_time)
         self._settles = gains.settling_time if known else wanted.duration
         self._takes = wanted.duration + 2.0 * self._settles
-        # The predicted range of the command [u].
-        self._expected = [self._commands.clip(rest.baseline + end) for end in wanted.command]
+        self._expected = choice.expected(wanted)
 
     @property
     def plan(self) -> str:
         """What will move, how far and how long."""
         options, commands = self._loop.options, self._commands
-        rest, (least, most) = self._rest, self._expected
-        runs = ""
+        rest, runs = self._rest, ""
         if self.rate is not None:
             runs = f", which runs {self.rate.law.name} every {self.rate.period:g} s,"
         return (
@@ -176,7 +172,7 @@ class Proof:
             f"{rest.setpoint:.6g} y and {rest.baseline:.6g} u, moves the set-point of "
             f"{options.measurement} by {self.step:+g} y and back, and ends at "
             f"{rest.baseline:.6g} u after about {duration(self._takes)}. {options.command} is "
-            f"expected from {least:.3g} to {most:.3g} u, never beyond "
+            f"expected {self._expected}, never beyond "
             f"{commands.low:g} to {commands.high:g} u."
         )
 

@@ -218,81 +218,103 @@ def noise_of(noise_std: float, residual_rms: float) -> float:
     return float(np.fmax(noise_std, residual_rms))
 
 
-def proving_step(
-    record: Record, model: TransferFunction, measurement: Limits, command: Limits, noise_std: float
-) -> float:
-    """Return the step of the set-point that proves gains best [y], in two digits; 0: not known.
+@dataclass(frozen=True)
+class StepChoice:
+    """What decides the step of the set-point that is to prove gains after a tune.
 
-    It is half of the swing that the tune made, at least twenty times the noise, upward if the
-    limits allow; the process then rests at most at 0.8 of the way to a limit. It is forty times
-    the noise if that is a third of the way at most.
-
-    :param record: of the tune, about whose set-point and mean command the loop rests.
+    :param record: of the tune, with its settings; the loop rests about its set-point and mean
+        command.
     :param model: the process.
     :param measurement: its range [y].
     :param command: its range [u].
     :param noise_std: of :func:`noise_of` [y].
     """
-    if record.settings is None or len(record.cycle_start) < 2:
-        return 0.0
-    first, stop = record.cycle_start[-2:]
-    swing = 0.5 * float(np.ptp(record.measurement[first : stop + 1]))
-    noise = 0.0 if math.isnan(noise_std) else noise_std
-    wanted = max(_OF_SWING * swing, _OF_NOISE * noise)
-    down, up = _ways(record, model, measurement, command)
-    sign = 1.0 if _OF_ROOM * up >= wanted or up >= down else -1.0
-    room = max(up if sign > 0.0 else down, 0.0)
-    height = max(min(wanted, _OF_ROOM * room), min(_CLEAR_OF_NOISE * noise, _OF_WIDE_ROOM * room))
-    return sign * float(f"{height:.2g}")
 
+    record: Record
+    model: TransferFunction
+    measurement: Limits
+    command: Limits
+    noise_std: float
 
-def allowed_steps(
-    record: Record,
-    model: TransferFunction,
-    measurement: Limits,
-    command: Limits,
-    wanted: Plan,
-    noise_std: float,
-) -> StepRange:
-    """Return the steps of the set-point that limits allow and noise does not hide, in two digits.
+    @property
+    def _noise(self) -> float:
+        return 0.0 if math.isnan(self.noise_std) else self.noise_std
 
-    The predicted peak, with an allowance for the noise, stays within the limits of the
-    measurement, and the command can hold the new set-point.
+    @property
+    def best(self) -> float:
+        """The step that proves gains best [y], in two digits; 0: not known.
 
-    :param record: of the tune, with its settings.
-    :param model: the process.
-    :param measurement: its range [y].
-    :param command: its range [u].
-    :param wanted: for a step of the set-point by 1.
-    :param noise_std: of :func:`noise_of` [y].
-    """
-    assert record.settings is not None
-    setpoint, peak = record.settings.setpoint, wanted.peak
-    noise = 0.0 if math.isnan(noise_std) else noise_std
-    spared = NOISE_ALLOWANCE * noise
-    down, up = _ways(record, model, measurement, command)
-    return StepRange(
-        0.0 - _rounded_down(min(down, (setpoint - measurement.low - spared) / peak)),
-        _rounded_down(min(up, (measurement.high - setpoint - spared) / peak)),
-        rounded_up(wanted.visible * noise),
-    )
+        It is half of the swing that the tune made, at least twenty times the noise, upward if the
+        limits allow; the process then rests at most at 0.8 of the way to a limit. It is forty
+        times the noise if that is a third of the way at most.
+        """
+        record = self.record
+        if record.settings is None or len(record.cycle_start) < 2:
+            return 0.0
+        first, stop = record.cycle_start[-2:]
+        swing = 0.5 * float(np.ptp(record.measurement[first : stop + 1]))
+        wanted = max(_OF_SWING * swing, _OF_NOISE * self._noise)
+        down, up = self._ways
+        sign = 1.0 if _OF_ROOM * up >= wanted or up >= down else -1.0
+        room = max(up if sign > 0.0 else down, 0.0)
+        clear = min(_CLEAR_OF_NOISE * self._noise, _OF_WIDE_ROOM * room)
+        height = max(min(wanted, _OF_ROOM * room), clear)
+        return sign * float(f"{height:.2g}")
 
+    def plan(self, control: Control, step: float) -> Plan:
+        """Return the plan of a step of the set-point.
 
-def _ways(
-    record: Record, model: TransferFunction, measurement: Limits, command: Limits
-) -> tuple[float, float]:
-    """Return how far below and above its set-point a loop can rest [y]."""
-    assert record.settings is not None
-    setpoint = record.settings.setpoint
-    down, up = setpoint - measurement.low, measurement.high - setpoint
-    if model.integrators == 0:
-        baseline = record.settings.baseline
-        if len(record.cycle_start) > 1:
-            first, stop = record.cycle_start[-2:]
-            baseline = float(np.mean(record.command[first:stop]))
-        ends = sorted(model.gain * (end - baseline) for end in (command.low, command.high))
-        down, up = min(down, -ends[0]), min(up, ends[1])
-    return down, up
+        :param control: the gains, and what runs them.
+        :param step: y.
+        :raises TuningError: as :func:`plan`.
+        """
+        return plan(control, self.model, Step(setpoint=step), self.record.mean_interval)
+
+    def allowed(self, wanted: Plan) -> StepRange:
+        """Return the steps that limits allow and noise does not hide, in two digits.
+
+        The predicted peak, with an allowance for the noise, stays within the limits of the
+        measurement, and the command can hold the new set-point.
+
+        :param wanted: for a step of the set-point by 1.
+        """
+        assert self.record.settings is not None
+        setpoint, spared = self.record.settings.setpoint, NOISE_ALLOWANCE * self._noise
+        low, high = setpoint - self.measurement.low, self.measurement.high - setpoint
+        down, up = self._ways
+        return StepRange(
+            0.0 - _rounded_down(min(down, (low - spared) / wanted.peak)),
+            _rounded_down(min(up, (high - spared) / wanted.peak)),
+            rounded_up(wanted.visible * self._noise),
+        )
+
+    def expected(self, wanted: Plan) -> str:
+        """Return the predicted range of the command with a step, for people.
+
+        :param wanted: for the step.
+        """
+        assert self.record.settings is not None
+        rest = self.record.settings.baseline
+        low, high = (self.command.clip(rest + end) for end in wanted.command)
+        return f"from {low:.3g} to {high:.3g} u"
+
+    @property
+    def _ways(self) -> tuple[float, float]:
+        """How far below and above its set-point the loop can rest [y]."""
+        record, model = self.record, self.model
+        assert record.settings is not None
+        setpoint = record.settings.setpoint
+        down, up = setpoint - self.measurement.low, self.measurement.high - setpoint
+        if model.integrators == 0:
+            baseline = record.settings.baseline
+            if len(record.cycle_start) > 1:
+                first, stop = record.cycle_start[-2:]
+                baseline = float(np.mean(record.command[first:stop]))
+            ends = sorted(
+                model.gain * (end - baseline) for end in (self.command.low, self.command.high)
+            )
+            down, up = min(down, -ends[0]), min(up, ends[1])
+        return down, up
 
 
 def _rounded_down(value: float) -> float:

@@ -16,8 +16,8 @@ from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
-from relay_autotune.control import verification
 from relay_autotune.control.controller import Control
+from relay_autotune.control.verification import StepChoice, StepRange, noise_of
 from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import (
     gains_from_message,
@@ -35,7 +35,6 @@ from relay_autotune.nodes.shell import prefix
 from relay_autotune.nodes.tables import FIXED, GAINS, rate_from, rate_of
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import may_pass
-from relay_autotune.record.record import Record
 from relay_autotune.text import TOLD_EVERY, duration, visible
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, Verification
@@ -137,7 +136,7 @@ class GainsClient(LoopClient):
         :raises LoopError: if there is no model.
         """
         message = self._result(ModelMessage, "transfer_function")
-        return verification.noise_of(message.noise_std, message.residual_rms)
+        return noise_of(message.noise_std, message.residual_rms)
 
     def _result(self, kind: Any, topic: str) -> Any:
         found = self.latched(kind, topic, lambda m: m.final, _RESULT_WITHIN)
@@ -227,6 +226,22 @@ class GainsClient(LoopClient):
         finally:
             self.set_values(self.name, before)
 
+    def step_choice(self) -> StepChoice | None:
+        """Return what decides the step that proves gains; None: no tune has left its record.
+
+        :raises RelayAutotuneError: if its model is not there.
+        """
+        found = self.latched(
+            RelayExperiment, "relay_experiment", lambda m: len(m.cycle_start) > 1, _RESULT_WITHIN
+        )
+        if found is None:
+            return None
+        low, high, least, most = self.values(self.name, LIMITS).values()
+        return StepChoice(
+            record_from_message(found), self.model(), Limits(low, high), Limits(least, most),
+            self.noise(),
+        )  # fmt: skip
+
     def usual_step(self) -> float | None:
         """Return the step of the node, else the one that proves most within its limits [y].
 
@@ -234,14 +249,10 @@ class GainsClient(LoopClient):
         """
         if given := self.values(self.name, ["verify_step"])["verify_step"]:
             return float(given)
-        record = self._record()
-        if record is None:
-            return None
-        return (
-            verification.proving_step(record, self.model(), *self._limits(), self.noise()) or None
-        )
+        choice = self.step_choice()
+        return choice.best or None if choice else None
 
-    def allowed_steps(self, gains: Controller) -> verification.StepRange:
+    def allowed_steps(self, gains: Controller) -> StepRange:
         """Return the steps of the set-point that the limits of the node allow.
 
         Without the record of a tune it is not known where the loop rests: the node alone refuses.
@@ -249,12 +260,25 @@ class GainsClient(LoopClient):
         :param gains: those that are to make the step.
         :raises RelayAutotuneError: if the model is not there, or the loop would be unstable.
         """
-        record = self._record()
-        if record is None:
-            return verification.StepRange()
-        model, step = self.model(), verification.Step(setpoint=1.0)
-        wanted = verification.plan(self._control(gains), model, step, record.mean_interval)
-        return verification.allowed_steps(record, model, *self._limits(), wanted, self.noise())
+        choice = self.step_choice()
+        if choice is None:
+            return StepRange()
+        return choice.allowed(choice.plan(self._control(gains), 1.0))
+
+    def expected(self, gains: Controller, step: float) -> str:
+        """Say what a step of the set-point will do; empty: no tune has left its record.
+
+        :param gains: those that are to make the step.
+        :param step: y.
+        :raises RelayAutotuneError: as :meth:`allowed_steps`.
+        """
+        if (choice := self.step_choice()) is None:
+            return ""
+        wanted = choice.plan(self._control(gains), step)
+        return (
+            f"The command is expected {choice.expected(wanted)}, for about "
+            f"{duration(wanted.duration)}."
+        )
 
     def _control(self, gains: Controller) -> Control:
         """Return gains as they run in the node that controls."""
@@ -264,18 +288,6 @@ class GainsClient(LoopClient):
         newest, _ = self.waiting()
         rate = rate_of(newest.law, newest.law_period)
         return in_another_node(gains, rate, values["apply_feedforward"])
-
-    def _limits(self) -> tuple[Limits, Limits]:
-        """Return the ranges of measurement and command."""
-        low, high, least, most = self.values(self.name, LIMITS).values()
-        return Limits(low, high), Limits(least, most)
-
-    def _record(self) -> Record | None:
-        """Return the newest record of a tune with a limit cycle; None: there is none."""
-        found = self.latched(
-            RelayExperiment, "relay_experiment", lambda m: len(m.cycle_start) > 1, _RESULT_WITHIN
-        )
-        return None if found is None else record_from_message(found)
 
     def prove(
         self,

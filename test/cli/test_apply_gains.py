@@ -148,7 +148,7 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     client: Any = SimpleNamespace(
         in_force=lambda: None, model=lambda: MODEL, noise=lambda: 0.01,
         waiting=lambda: (GAINS, ""), has=lambda gains: False, usual_step=lambda: 3.0,
-        ask=asked.append,
+        ask=asked.append, expected=lambda gains, step: f"The command goes to {step:g} u.",
         allowed_steps=lambda gains: StepRange(-1.5, 2.0 if gains is GAINS else 0.0),
         values=lambda node, names: {"verify_step": 0.0}, name="controller_node",
     )  # fmt: skip
@@ -163,7 +163,8 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
     assert apply_gains.apply_and_verify(client, given) == (False, "")
     told = capsys.readouterr()
-    assert "a step of the set-point by 2 y" in told.out
+    said = " ".join(told.out.split())
+    assert "a step of the set-point by 2 y? The command goes to 2 u." in said
     assert "from -1.5 to 2 y" in told.err
     assert not asked and not answers
 
@@ -173,6 +174,7 @@ def client_of(prove: Any, in_force: Any) -> Any:
         in_force=in_force, model=lambda: MODEL, noise=lambda: 0.01,
         waiting=lambda: (GAINS, ""), has=lambda gains: in_force() is gains,
         allowed_steps=lambda gains: StepRange(), name="controller_node", prove=prove,
+        expected=lambda gains, step: "",
         values=lambda node, names: {"verify_step": 0.0},
     )  # fmt: skip
 

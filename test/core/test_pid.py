@@ -18,13 +18,12 @@ from scipy.integrate import solve_ivp
 from relay_autotune.control.controller import Control, GainBounds, PidController, run_loop
 from relay_autotune.control.verification import (
     Step,
+    StepChoice,
     StepRange,
-    allowed_steps,
     compare,
     describe,
     noise_of,
     plan,
-    proving_step,
     rounded_up,
 )
 from relay_autotune.errors import TuningError
@@ -232,9 +231,9 @@ def test_the_step_that_proves_is_clear_of_the_noise_and_within_limits(
     noise = noise_of(0.5 * noise_std, noise_std)
     assert noise == noise_of(noise_std, math.nan) == noise_std
     commands = Limits(0.0, command_high)
-    assert proving_step(record, model, room, commands, noise) == height
+    assert StepChoice(record, model, room, commands, noise).best == height
     # Without room on either side it goes as far as it can.
-    tight = proving_step(record, model, Limits(39.9, 40.1), commands, noise)
+    tight = StepChoice(record, model, Limits(39.9, 40.1), commands, noise).best
     assert abs(tight) == pytest.approx(0.08)
 
 
@@ -246,8 +245,8 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
     model, gains = TransferFunction.fopdt(1.65, 1.0, 0.5), Controller(kc=0.9, ti=0.9)
     wanted = plan(Control(gains), model, Step(setpoint=1.0), 0.01)
     assert 1.1 < wanted.peak < 2.0
-    limits = Limits(30.0, 42.0)
-    allowed = allowed_steps(record, model, limits, Limits(0.0, 5.0), wanted, 0.02)
+    choice = StepChoice(record, model, Limits(30.0, 42.0), Limits(0.0, 5.0), 0.02)
+    allowed = choice.allowed(wanted)
     low, high = allowed.low, allowed.high
     assert allowed.least == rounded_up(0.02 * wanted.visible) == pytest.approx(0.15, abs=0.04)
     # The command holds down to 3.3 below; the peak of the next step of two digits is too high.
@@ -257,7 +256,7 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
     ]
     assert at_peak[0] < 2.0 - 3.0 * 0.02 < at_peak[1]
     peak = replace(wanted, peak=1.2, visible=0.0)
-    narrow = allowed_steps(record, model, Limits(39.9, 40.05), Limits(0.0, 5.0), peak, 0.02)
+    narrow = replace(choice, measurement=Limits(39.9, 40.05)).allowed(peak)
     assert narrow == StepRange(-0.033, 0.0)
     narrow.require(-0.03)
     for wrong in (0.01, 0.0, -0.04, math.nan):
