@@ -51,14 +51,14 @@ _DEPENDENT, _ROUNDING = 1e-9, 1e-13
 class Difference:
     """The response that a record shows beside the model's, without a structure.
 
-    :param edges: of the bins of the lag [s], shape (m + 1,).
+    :param lags: ends of their bins [s], shape (m + 1,).
     :param mean: increments of its step response [y/u], shape (m,).
     :param root: of their covariance, shape (m, k).
     :param residual: rms of what neither model nor difference explain [y].
     :param lowest: frequency of which the record shows one radian [rad/s].
     """
 
-    edges: FloatArray
+    lags: FloatArray
     mean: FloatArray
     root: FloatArray
     residual: float
@@ -71,7 +71,7 @@ class Difference:
         :param rng: the source.
         """
         normal = rng.standard_normal((count, self.root.shape[1]))
-        return ModelErrors(self.edges, self.mean + normal @ self.root.T, self.lowest)
+        return ModelErrors(self.lags, self.mean + normal @ self.root.T, self.lowest)
 
 
 def widened(found: Identification, beside: Difference | None) -> Identification:
