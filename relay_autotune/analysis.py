@@ -22,11 +22,7 @@ from relay_autotune.errors import IdentificationError, RelayAutotuneError, Tunin
 from relay_autotune.experiment.early_end import MS
 from relay_autotune.identification.judgement.assessment import assess, is_far_off
 from relay_autotune.identification.judgement.checks import unequal_amplitudes
-from relay_autotune.identification.judgement.difference import (
-    Difference,
-    difference,
-    widened,
-)
+from relay_autotune.identification.judgement.difference import difference, widened
 from relay_autotune.identification.judgement.disturbance import without_disturbance
 from relay_autotune.identification.judgement.evidence import Evidence
 from relay_autotune.identification.judgement.table import MODEL_CHECKS
@@ -41,16 +37,15 @@ from relay_autotune.identification.methods import (
 from relay_autotune.identification.result import Identification
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.ultimate import UltimatePoint
-from relay_autotune.quantities import LONGEST, NORMAL_95, SHORTEST, Quantity, declared
+from relay_autotune.quantities import NORMAL_95, Quantity, declared
 from relay_autotune.record.cycles import cycles_of, limit_cycle
 from relay_autotune.record.record import Cycle, Outcome, Record, one_record
 from relay_autotune.record.thinning import thinned
 from relay_autotune.result import Analysis, Shaping
 from relay_autotune.text import digits
 from relay_autotune.tuning import DEFAULT_RULE, RULES, design, rule_named
-from relay_autotune.tuning.ensemble import DRAWS, ensemble, predicted_ms
-from relay_autotune.tuning.rules.formulas import describing_point_of_cycle
+from relay_autotune.tuning.ensemble import predicted_ms
+from relay_autotune.tuning.of_record import sampling_period, task_of_record, warned_of_rows
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import NOT_JUDGED, Finding, Judgement, Result, Verdict, judge
 
@@ -149,7 +144,11 @@ def analyse(
     if alone:
         simple = chosen.simple(task)
     rules = (rule,) if alone else _first(rule)
-    return _assessed(chosen, models, _Tuning(task, rules, simple, rng, tell))
+    tell("judging the model")
+    record, cycles = chosen.record, chosen.cycles
+    found = Analysis(record, cycles, assess(models, record), 0)
+    settled = bool(cycles) and limit_cycle(cycles).converged
+    return _judged(found, (record,), _Tuning(task, rules, simple, rng, tell), settled=settled)
 
 
 def model_so_far(record: Record, task: Task | None = None) -> Analysis:
@@ -173,8 +172,8 @@ def prediction_so_far(record: Record, task: Task) -> Analysis:
     chosen = _chosen_so_far(record, task)
     if isinstance(chosen, Analysis):
         return chosen
-    tuning = _Tuning(task, (task.rule,), chosen.simple(task))
-    predicted = predicted_ms(tuning.design_task(chosen.alone), rule_named(task.rule))
+    designed = task_of_record(chosen.alone, task.options, chosen.simple(task))
+    predicted = predicted_ms(designed, rule_named(task.rule))
     return replace(chosen.alone, predicted=predicted)
 
 
@@ -258,38 +257,13 @@ class _Tuning:
     rng: np.random.Generator | None = None
     tell: Tell = _quiet
 
-    def design_task(self, found: Analysis, beside: Difference | None = None) -> DesignTask:
-        """Return what the rules are given for the selected model of an analysis.
-
-        :param beside: what the record shows beside the model; None: it was not asked.
-        """
-        chosen = found.models[0]
-        options = _with_noise(self.task.options, found)
-        rng = self.rng or np.random.default_rng(0)
-        models = ensemble(chosen, rng=rng)
-        if beside is not None and not models:
-            models = (chosen.model,) * DRAWS
-        unseen = _unseen(found.record, self.task.options)
-        if unseen:
-            options = replace(options, loop_delay=options.loop_delay + 0.5 * unseen)
-            models = _spread_in_time(models, unseen, rng)
-        return DesignTask(
-            model=chosen.model,
-            options=options,
-            simple=self.simple,
-            models=models,
-            errors=None if beside is None else beside.draws(len(models), rng),
-            describing=_describing_point(found),
-            recorded_period=_clock_of(found.record),
-        )
-
 
 def _chosen(record: Record, task: Task) -> _Chosen | Analysis:
     """Return the selected model; without a model, the analysis with the reason."""
     record = thinned(record)
     cycles: tuple[Cycle, ...] = ()
     try:
-        _sampling_period(record)
+        sampling_period(record)
         cycles = cycles_of(record)
         chosen = _with_remarks(_guarded(record, task.method, task.known), (record,))
     except RelayAutotuneError as error:
@@ -311,15 +285,6 @@ def _chosen_so_far(record: Record, task: Task) -> _Chosen | Analysis:
     # The record contradicts this model, so its interval must not end a test.
     model = replace(chosen.model, ultimate_gain_std=math.nan, ultimate_frequency_std=math.nan)
     return replace(chosen, model=model)
-
-
-def _assessed(chosen: _Chosen, models: Sequence[Identification], tuning: _Tuning) -> Analysis:
-    """Judge models, the selected one first, and tune it."""
-    record = chosen.record
-    tuning.tell("judging the model")
-    found = Analysis(record, chosen.cycles, assess(models, record), 0)
-    settled = bool(chosen.cycles) and limit_cycle(chosen.cycles).converged
-    return _judged(found, (record,), tuning, settled=settled)
 
 
 def analyse_jointly(
@@ -354,7 +319,7 @@ def analyse_jointly(
     cycles: tuple[Cycle, ...] = ()
     try:
         for record in records:
-            _sampling_period(record)
+            sampling_period(record)
         cycles = cycles_of(first)
         chosen = _with_remarks(identify_jointly(records, method, known), records)
     except RelayAutotuneError as error:
@@ -388,9 +353,11 @@ def _judged(
     if judgement.verdict is Verdict.NONE:
         return _without_gains(found, judgement)
     tuning.tell("designing the gains")
-    shaping = Shaping(tuning.design_task(found, beside), evidence, findings)
-    found = replace(_warned_of_rows(found, tuning.task.options), shaping=shaping)
-    tuned = _tuned(found, shaping.task, tuning.rules)
+    options = tuning.task.options
+    task = task_of_record(found, options, tuning.simple, tuning.rng, beside)
+    shaping = Shaping(task, evidence, findings)
+    found = replace(warned_of_rows(found, options), shaping=shaping)
+    tuned = _tuned(found, task, tuning.rules)
     gains = tuned.best_gains
     if gains is None:
         return replace(tuned, judgement=replace(judgement, refused=tuned.reason))
@@ -448,106 +415,6 @@ def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
             continue
     delay = task.options.added_delay
     return replace(found, gains=tuple(gains), recommended=0, added_delay=delay)
-
-
-def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
-    """Take noise, amplitude and sampling period from the record if they are not given."""
-    record, chosen = found.record, found.models[0]
-    # The controller will see single samples, not means of many.
-    before = record.unthinned
-    if math.isnan(options.noise_std):
-        measured = record.noise_std if record.noise_std > 0.0 else chosen.fit.residual_rms
-        measured = measured if before is None else before.noise
-        options = replace(options, noise_std=measured)
-    if math.isnan(options.amplitude):
-        # Without relay settings: half of the command's range.
-        settings, half = record.settings, 0.5 * float(np.ptp(record.command))
-        options = replace(options, amplitude=half if settings is None else abs(settings.amplitude))
-    if options.sample_period == 0.0:
-        options = replace(options, sample_period=_clock_of(record))
-    return options
-
-
-def _clock_of(record: Record) -> float:
-    """Return the time between samples without the jitter of the stamps [s]; 0: there is none."""
-    # No program is set to further digits.
-    return float(f"{_sampling_period(record):.3g}")
-
-
-def _unseen(record: Record, options: DesignOptions) -> float:
-    """Return how long before its row a change of the command may have come [s]; 0: not at all.
-
-    A controller that runs more often than the rows of a table is not the one that wrote them: it
-    moved the command anywhere between two of them, and what the model takes for its dead time is
-    too short by up to the time between them.
-    """
-    if not (record.is_table and options.sample_period > 0.0):
-        return 0.0
-    return max(_sampling_period(record) - options.sample_period, 0.0)
-
-
-def _spread_in_time(
-    models: Sequence[TransferFunction], unseen: float, rng: np.random.Generator
-) -> tuple[TransferFunction, ...]:
-    """Return models whose dead times are spread evenly over a time about their own.
-
-    :param models: n of them.
-    :param unseen: that time [s].
-    :param rng: decides which of them is how late.
-    """
-    late = rng.permutation(unseen * ((np.arange(len(models)) + 0.5) / len(models) - 0.5))
-    return tuple(
-        replace(m, dead_time=max(m.dead_time + float(by), 0.0))
-        for m, by in zip(models, late, strict=True)
-    )
-
-
-def _warned_of_rows(found: Analysis, options: DesignOptions) -> Analysis:
-    """Add to the selected model's warnings what its record does not show of the command."""
-    unseen = _unseen(found.record, options)
-    if not unseen:
-        return found
-    told = (
-        f"a change of the command may have come up to {digits(unseen, 3)} s before its row, "
-        "since the controller is to run more often than these were written: the gains allow "
-        "for as much more dead time; log faster, or add a row at each change"
-    )
-    chosen, *others = found.models
-    chosen = replace(chosen, warnings=(*chosen.warnings, told))
-    return replace(found, models=(chosen, *others))
-
-
-def _sampling_period(record: Record) -> float:
-    """Return the time between the samples as they were taken [s].
-
-    :raises IdentificationError: if no clock can have given it.
-    """
-    before = record.unthinned
-    period = 0.0 if len(record) < 2 else record.interval if before is None else before.interval
-    if period and not SHORTEST <= period <= LONGEST:
-        raise IdentificationError(
-            f"the samples are {period:.3g} s apart, expected {SHORTEST:g} to {LONGEST:g} s: check "
-            f"the unit of the time"
-        )
-    return period
-
-
-def _describing_point(found: Analysis) -> UltimatePoint | None:
-    """Return the describing function's ultimate point of the limit cycle; None without cycle."""
-    settings = found.record.settings
-    if not found.cycles or settings is None:
-        return None
-    cycle = limit_cycle(found.cycles)
-    amplitude = 0.5 * (cycle.peak_max - cycle.peak_min)
-    if not amplitude > 0.0:
-        return None
-    return describing_point_of_cycle(
-        cycle.period,
-        cycle.period_high,
-        amplitude,
-        settings.amplitude,
-        found.models[0].model.process_sign,
-    )
 
 
 def _guarded(record: Record, method: str, known: Known) -> Identification:

@@ -1,0 +1,165 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a design takes from the record: noise, amplitude, clock, and what its rows do not show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from relay_autotune.errors import IdentificationError
+from relay_autotune.identification.judgement.difference import Difference
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import UltimatePoint
+from relay_autotune.quantities import LONGEST, SHORTEST
+from relay_autotune.record.cycles import limit_cycle
+from relay_autotune.record.record import Record
+from relay_autotune.result import Analysis
+from relay_autotune.text import digits
+from relay_autotune.tuning.ensemble import DRAWS, ensemble
+from relay_autotune.tuning.rules.formulas import describing_point_of_cycle
+from relay_autotune.tuning.task import DesignOptions, DesignTask
+
+
+def task_of_record(
+    found: Analysis,
+    options: DesignOptions,
+    simple: TransferFunction | None,
+    rng: np.random.Generator | None = None,
+    beside: Difference | None = None,
+) -> DesignTask:
+    """Return what the rules are given for the selected model of an analysis.
+
+    :param found: the analysis.
+    :param options: as they were given.
+    :param simple: the FOPDT that most rules need; None: there is none.
+    :param rng: draws the models within the uncertainty; None: of a fixed seed.
+    :param beside: what the record shows beside the model; None: it was not asked.
+    """
+    chosen, rng = found.models[0], rng or np.random.default_rng(0)
+    given, options = options, _with_noise(options, found)
+    models = ensemble(chosen, rng=rng)
+    if beside is not None and not models:
+        models = (chosen.model,) * DRAWS
+    unseen = _unseen(found.record, given)
+    if unseen:
+        options = replace(options, loop_delay=options.loop_delay + 0.5 * unseen)
+        models = _spread_in_time(models, unseen, rng)
+    return DesignTask(
+        model=chosen.model,
+        options=options,
+        simple=simple,
+        models=models,
+        errors=None if beside is None else beside.draws(len(models), rng),
+        describing=_describing_point(found),
+        recorded_period=_clock_of(found.record),
+    )
+
+
+def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
+    """Take noise, amplitude and sampling period from the record if they are not given."""
+    record, chosen = found.record, found.models[0]
+    # The controller will see single samples, not means of many.
+    before = record.unthinned
+    if math.isnan(options.noise_std):
+        measured = record.noise_std if record.noise_std > 0.0 else chosen.fit.residual_rms
+        measured = measured if before is None else before.noise
+        options = replace(options, noise_std=measured)
+    if math.isnan(options.amplitude):
+        # Without relay settings: half of the command's range.
+        settings, half = record.settings, 0.5 * float(np.ptp(record.command))
+        options = replace(options, amplitude=half if settings is None else abs(settings.amplitude))
+    if options.sample_period == 0.0:
+        options = replace(options, sample_period=_clock_of(record))
+    return options
+
+
+def _clock_of(record: Record) -> float:
+    """Return the time between samples without the jitter of the stamps [s]; 0: there is none."""
+    # No program is set to further digits.
+    return float(f"{sampling_period(record):.3g}")
+
+
+def _unseen(record: Record, options: DesignOptions) -> float:
+    """Return how long before its row a change of the command may have come [s]; 0: not at all.
+
+    A controller that runs more often than the rows of a table is not the one that wrote them: it
+    moved the command anywhere between two of them, and what the model takes for its dead time is
+    too short by up to the time between them.
+    """
+    if not (record.is_table and options.sample_period > 0.0):
+        return 0.0
+    return max(sampling_period(record) - options.sample_period, 0.0)
+
+
+def _spread_in_time(
+    models: Sequence[TransferFunction], unseen: float, rng: np.random.Generator
+) -> tuple[TransferFunction, ...]:
+    """Return models whose dead times are spread evenly over a time about their own.
+
+    :param models: n of them.
+    :param unseen: that time [s].
+    :param rng: decides which of them is how late.
+    """
+    late = rng.permutation(unseen * ((np.arange(len(models)) + 0.5) / len(models) - 0.5))
+    return tuple(
+        replace(m, dead_time=max(m.dead_time + float(by), 0.0))
+        for m, by in zip(models, late, strict=True)
+    )
+
+
+def warned_of_rows(found: Analysis, options: DesignOptions) -> Analysis:
+    """Add to the selected model's warnings what its record does not show of the command.
+
+    :param found: the analysis.
+    :param options: as they were given.
+    """
+    unseen = _unseen(found.record, options)
+    if not unseen:
+        return found
+    told = (
+        f"a change of the command may have come up to {digits(unseen, 3)} s before its row, "
+        "since the controller is to run more often than these were written: the gains allow "
+        "for as much more dead time; log faster, or add a row at each change"
+    )
+    chosen, *others = found.models
+    chosen = replace(chosen, warnings=(*chosen.warnings, told))
+    return replace(found, models=(chosen, *others))
+
+
+def sampling_period(record: Record) -> float:
+    """Return the time between the samples as they were taken [s].
+
+    :param record: the record.
+    :raises IdentificationError: if no clock can have given it.
+    """
+    before = record.unthinned
+    period = 0.0 if len(record) < 2 else record.interval if before is None else before.interval
+    if period and not SHORTEST <= period <= LONGEST:
+        raise IdentificationError(
+            f"the samples are {period:.3g} s apart, expected {SHORTEST:g} to {LONGEST:g} s: check "
+            f"the unit of the time"
+        )
+    return period
+
+
+def _describing_point(found: Analysis) -> UltimatePoint | None:
+    """Return the describing function's ultimate point of the limit cycle; None without cycle."""
+    settings = found.record.settings
+    if not found.cycles or settings is None:
+        return None
+    cycle = limit_cycle(found.cycles)
+    amplitude = 0.5 * (cycle.peak_max - cycle.peak_min)
+    if not amplitude > 0.0:
+        return None
+    return describing_point_of_cycle(
+        cycle.period,
+        cycle.period_high,
+        amplitude,
+        settings.amplitude,
+        found.models[0].model.process_sign,
+    )
