@@ -141,6 +141,29 @@ def test_a_narrow_page_does_not_scroll_sideways_and_dark_is_dark(browser, url, d
         assert 0 <= top < 844, part
 
 
+def test_on_a_phone_controls_are_as_high_as_a_finger_and_gains_stay_whole(browser, url):
+    tab = browser.tab()
+    tab.size(390, 844)
+    tab.go(url)
+    shown(tab)
+    tab.eval("document.querySelector('#form').innerHTML = '<span><input></span>'")
+    tab.eval("document.querySelector('#plan').showModal()")
+    heights = tab.eval(
+        "[...document.querySelectorAll('button, select, input, summary')]"
+        ".filter((each) => each.checkVisibility())"
+        ".map((each) => [each.outerHTML, Math.max(each.offsetHeight,"
+        "each.closest('fieldset label')?.offsetHeight ?? 0)])"
+    )
+    assert len(heights) > 20
+    assert [each for each in heights if each[1] < 44] == []
+    # A phone zooms into a field whose text is smaller.
+    size = "getComputedStyle(document.querySelector('#form input')).fontSize"
+    assert tab.eval(size) == "16px"
+    # "b" and its number are on one line
+    spans = "[...document.querySelectorAll('#gains span')]"
+    assert tab.eval(f"{spans}.map((each) => each.getClientRects().length)") == [1, 1, 1, 1]
+
+
 def test_everything_that_acts_or_shows_has_a_name_for_a_screen_reader(browser, url):
     tab = browser.tab(url)
     shown(tab)

@@ -153,9 +153,9 @@ function showTrade() {
   plots.trade.draw({ curves, marks, said });
 }
 
-function gainsWords(s, between = ", ") {
+function gainsWords(s) {
   return s.isa.filter(([name, value]) => value !== "0" && name !== "tf")
-    .map(([name, value, unit]) => `${name} ${value}${unit ? ` ${unit}` : ""}`).join(between);
+    .map(([name, value, unit]) => `${name} ${value}${unit ? ` ${unit}` : ""}`);
 }
 
 function showBeside() {
@@ -193,7 +193,8 @@ function showShaped(s, sketched) {
     showKeep(s.exports);
     showTrade();
   }
-  $("gains").textContent = (sketched ? "about " : "") + gainsWords(s, "   ");
+  $("gains").textContent = sketched ? "about " : "";
+  for (const words of gainsWords(s)) { put($("gains"), "span", words); $("gains").append("   "); }
   table($("isa"), s.isa, ["", "number", "unit", "meaning"]);
   table($("parallel"), s.parallel, ["", "number", "unit"]);
   table($("effects"), s.effects, ["", "", "interval"]);
@@ -338,7 +339,7 @@ async function download(path, more) {
 // The gains that the page shows now, for the running controller.
 function offered() {
   if (!shaped || subjects[chosen].loop !== live.loop.number) return null;
-  return { wish: { of: chosen, asked: shaped.asked }, words: gainsWords(shaped), doubtful: shaped.doubtful };
+  return { wish: { of: chosen, asked: shaped.asked }, words: gainsWords(shaped).join(", "), doubtful: shaped.doubtful };
 }
 
 // Another loop is shown, with its newest model.
