@@ -385,7 +385,8 @@ class Answers:
                 "unit": SETTING[name].unit,
                 "values": value if setting.ends > 1 else [value],
                 "ends": setting.ends,
-                "now": self.now(name),
+                # The form holds the present command itself.
+                "now": self.now(name) if name == "within" or "at" not in names else "",
                 "needed": needed,
             }
 

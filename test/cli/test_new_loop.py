@@ -593,6 +593,9 @@ def test_a_form_that_can_be_goes_to_relay_node_as_numbers() -> None:
     }  # fmt: skip
     assert all(isinstance(value, float) for value in sent.values())
     assert loop.options.amplitude == 1.0
+    # The present command stands in the form already.
+    form = loop.answers.form(loop.form, needed=True)
+    assert [row["now"] for row in form] == ["", "44 y now", "", ""]
     # What excludes what was before, and not each other.
     loop.set({"at": 12, "command_within": [10, 20]})
     assert sent["baseline"] == 12.0

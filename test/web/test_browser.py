@@ -134,6 +134,10 @@ def test_a_narrow_page_does_not_scroll_sideways_and_dark_is_dark(browser, url, d
     colour = tab.eval("getComputedStyle(document.body).backgroundColor")
     bright = sum(map(int, re.findall(r"\d+", colour)[:3])) / 3
     assert (bright < 60) if dark else (bright > 200)
+    # what the slider does stands above the other controls
+    tops = [tab.eval(f"document.querySelector('{each}').getBoundingClientRect().top")
+            for each in ("#steps", "#controller")]  # fmt: skip
+    assert tops == sorted(tops)
     # the verdict, the gains and the slider stay in view
     tab.eval("scrollTo(0, document.body.scrollHeight)")
     for part in ("#verdict", "#gains", "#ms"):

@@ -256,13 +256,45 @@ def test_abort_is_in_reach_while_a_tune_runs_and_its_model_can_be_shaped_then(tm
         tab.eval("scrollTo(0, document.body.scrollHeight)")
         assert 0 <= tab.eval("document.querySelector('#abort').getBoundingClientRect().top") < 700
         assert tab.eval("document.documentElement.scrollWidth") <= 390
-        assert tab.eval("document.querySelector('#start').disabled")
+        # a button that cannot be used takes no room from the figures
+        assert not tab.eval("document.querySelector('#start').checkVisibility()")
         live.sample("measurement", 41.0)
         tab.wait("document.querySelectorAll('#plot-live-measurement path.line').length === 3")
         tab.click("#abort")
         tab.until(live.abort.is_set, "the wish")
         live.tell(phase="idle", accepted=False)
         tab.wait("document.querySelector('#abort').disabled")
+        assert tab.eval("document.querySelector('#start').checkVisibility()")
+        assert tab.said == []
+
+
+@pytest.mark.browser
+def test_on_a_phone_a_wish_shows_what_comes_of_it_and_a_model_stands_once(tmp_path):
+    live = Live("/relay_node")
+    live.tell(proves=True, step=0.5, process="1 / (1 + s)")
+    curve = [[0.0, 1.0], [0.0, 1.0]]
+    step = {"name": "set-point step", "passed": True, "measurement": curve, "predicted": curve}
+    live.show("proof", [step])
+    live.tell(proof=(("verdict", "passed"),))
+    with served([subject_of(analysed())], live=live) as url, Chromium(tmp_path) as browser:
+        tab = browser.tab()
+        tab.size(390, 844)
+        tab.go(url)
+        tab.wait("!document.querySelector('#prove').disabled")
+        tab.wait("document.querySelectorAll('#plot-proof .curve').length === 2")
+        # the model is that of the experiment below
+        assert tab.text("#process")
+        assert not tab.eval("document.querySelector('#live-process').checkVisibility()")
+        tab.click("#prove")
+        tab.wait("document.querySelector('#question').open")
+        tab.eval("scrollTo(0, document.body.scrollHeight)")
+        tab.click("#question-yes")
+        tab.until(live.next_wish, "the wish")
+        assert tab.eval("scrollY") == 0
+        # the figure of a proof does not stand beside the gains of the next tune
+        live.tell(phase="tuning", proof=())
+        tab.wait("document.querySelector('#proof').hidden")
+        assert tab.eval("document.querySelector('#live-process').checkVisibility()")
         assert tab.said == []
 
 

@@ -195,7 +195,11 @@ export class Live {
 
   get signals() { return this.loop.signals; }
 
-  send(what, more, loop = this.loop) { this.wish(what, { loop: loop.number, ...more }); }
+  send(what, more, loop = this.loop) {
+    // What comes of it is told at the top.
+    if (what !== "check") window.scrollTo(0, 0);
+    this.wish(what, { loop: loop.number, ...more });
+  }
 
   // message: {loop: its number, live: what is known, shown: figures, samples: the newest,
   //           all: they replace those before}
@@ -326,6 +330,7 @@ export class Live {
     $("abort").disabled = !this.loop.running;
     $("abort").textContent = told.phase === "verifying" ? "End the verification" : "Abort the tune";
     $("check").disabled = $("start").disabled = told.phase !== "idle";
+    $("start").parentElement.hidden = this.loop.running;
     $("abort").hidden = !this.loop.running;
     $("progress").hidden = !tuning;
     $("progress").value = told.progress || 0;
@@ -349,6 +354,8 @@ export class Live {
     $("prove").hidden = runs;
     if (told.step !== null && (!before || before.step !== told.step)) $("step").value = told.step;
     table($("force-proof"), told.proof, ["", "text"]);
+    // The figure of a proof goes with its words: other gains have come since.
+    $("proof").hidden = !(told.proof.length && (this.loop.shown.proof || []).length);
     this.showForce();
   }
 
@@ -358,7 +365,7 @@ export class Live {
     const { controller, present, phase } = this.told;
     const new_ = this.offered();
     $("force-now").textContent = controller ? `${controller} has ${present}` : "Nobody controls this loop: a controller of this command makes one step, and ends.";
-    $("force-new").textContent = new_ ? `${controller ? "Applied" : "Proven"} would be ${new_.words}${new_.doubtful ? ", which are doubtful" : ""}.` : "The page shows no gains that could be applied.";
+    $("force-new").textContent = new_ ? `${controller ? "To apply" : "To prove"}: ${new_.words}${new_.doubtful ? ", which are doubtful" : ""}.` : "The page shows no gains that could be applied.";
     const idle = phase === "idle";
     const step = Number($("step").value);
     const moves = Number.isFinite(step) && step !== 0;
@@ -390,7 +397,7 @@ export class Live {
   }
 
   showProof(steps) {
-    $("proof").hidden = !steps.length;
+    $("proof").hidden = !(this.told.proof.length && steps.length);
     if (!steps.length) return;
     const [step] = steps;
     const curve = ([x, y], kind, name) => ({ x, y, kind, name });
@@ -497,6 +504,7 @@ export class Live {
     if (!$("plan").open || !loop.planned || told.checked < loop.planned) return;
     if (this.again) { this.checkPlan(); return; }
     $("plan-start").disabled = !told.accepted || told.phase !== "idle";
+    $("plan-check").hidden = told.accepted;
     $("plan-said").textContent = told.accepted ? "Nothing moves before you start the tune; it can be aborted at any time." : told.status;
     checklist($("plan-lines"), told.checks.filter(([mark, name]) => mark !== "ok" || PLAN.includes(name)));
   }

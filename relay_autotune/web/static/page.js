@@ -353,9 +353,8 @@ function showLoop() {
   document.title = `${live.told.node} - relay_autotune`;
   $("facts").replaceChildren();
   $("gains").textContent = $("verdict").textContent = "";
-  $("marks").textContent = "";
   $("notes").hidden = true;
-  saidChecks = "";
+  $("marks").textContent = saidChecks = "";
   live.showForce();
 }
 
