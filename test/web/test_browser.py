@@ -8,7 +8,7 @@ import re
 
 import pytest
 from chromium import Chromium
-from served import HOSTILE, hostile, served
+from served import HOSTILE, analysed, hostile, served, subject_of
 
 from relay_autotune.web.address import Address
 from relay_autotune.web.shape import DesignRequest
@@ -143,6 +143,20 @@ def test_a_narrow_page_does_not_scroll_sideways_and_dark_is_dark(browser, url, d
     for part in ("#verdict", "#gains", "#ms"):
         top = tab.eval(f"document.querySelector('{part}').getBoundingClientRect().top")
         assert 0 <= top < 844, part
+
+
+def test_on_a_phone_the_tabs_of_two_tunes_are_no_wider_than_it(browser, subject):
+    folder = "/home/operator/.ros/relay_autotune/20261127T035954Z_712b7c35"
+    with served([subject, subject_of(analysed(), folder)]) as url:
+        tab = browser.tab()
+        tab.size(390, 844)
+        tab.go(url)
+        shown(tab)
+        assert (
+            tab.eval("[...document.querySelectorAll('#tabs button')].at(-1).innerText") == folder
+        )
+        # A dialog on a wider page stands half outside of the screen.
+        assert tab.eval("document.documentElement.scrollWidth") <= 390
 
 
 def test_on_a_phone_controls_are_as_high_as_a_finger_and_gains_stay_whole(browser, url):
