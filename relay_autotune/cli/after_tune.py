@@ -28,7 +28,6 @@ from relay_autotune.cli.own_nodes import (
 )
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import (
-    StatusLine,
     Working,
     agreed_step,
     asked,
@@ -354,12 +353,8 @@ class AfterTune(Tuned):
 
     def _made(self, proof: Proof, step: float) -> Any:
         """Make the step, and show what it has found."""
-        shown = StatusLine()
-        with noted(lambda text: say(PROGRAM, text)) as leave:
-            try:
-                found = proof.made(step, bool(self.doubt), shown, leave)
-            finally:
-                shown.clear()
+        with noted(lambda text: say(PROGRAM, text)) as (shown, leave):
+            found = proof.made(step, bool(self.doubt), shown, leave)
         print()
         for entry in found_entries(found, proof.noise_std):
             tell(*entry)

@@ -27,7 +27,6 @@ from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, gua
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import (
     Help,
-    StatusLine,
     Working,
     agreed_step,
     agrees,
@@ -204,16 +203,13 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
         client.ask("apply")
         print(f"  {'gains':<16} in force, not verified; {PROGRAM} --verify-only makes the step")
         return True, ""
-    shown = StatusLine()
     new = None if options.verify_only else gains
-    with noted(lambda text: say(PROGRAM, text)) as leave:
-        try:
-            result, entries = verified(
-                client, step, shown, leave, new,
-                load=options.load, patience=options.wait, stays=options.stays,
-            )  # fmt: skip
-        finally:
-            shown.clear()
+    with noted(lambda text: say(PROGRAM, text)) as (shown, leave):
+        result, entries = verified(
+            client, step, shown, leave, new,
+            load=options.load, patience=options.wait, stays=options.stays,
+        )  # fmt: skip
+        shown.clear()
         for entry in entries:
             tell(*entry)
     return result.passed, "" if result.passed else result.reason

@@ -387,15 +387,16 @@ def end_with_terminal() -> None:
 
 
 @contextmanager
-def noted(tell: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
+def noted(tell: Callable[[str], None]) -> Iterator[tuple[StatusLine, Callable[[], bool]]]:
     """Only note signals in the block, and obey them after it.
 
     An exception could be lost in a callback of rclpy.
 
     :param tell: called with the error with which the block ends after a signal.
-    :return: what tells whether one has come.
+    :return: a line for the status, which ends with the block; what tells whether a signal came.
     """
     came: list[int] = []
+    shown = StatusLine()
     before = {
         number: signal.signal(number, lambda n, _: came.append(n))
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -403,12 +404,14 @@ def noted(tell: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN
     }
     try:
-        yield lambda: bool(came)
+        yield shown, lambda: bool(came)
     except RelayAutotuneError as error:
         if not came:
             raise
+        shown.clear()
         tell(str(error))
     finally:
+        shown.clear()
         for number, handler in before.items():
             signal.signal(number, handler)
         if came:
