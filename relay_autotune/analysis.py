@@ -172,7 +172,8 @@ def prediction_so_far(record: Record, task: Task) -> Analysis:
     chosen = _chosen_so_far(record, task)
     if isinstance(chosen, Analysis):
         return chosen
-    designed = task_of_record(chosen.alone, task.options, chosen.simple(task))
+    of = chosen.model, chosen.record, chosen.cycles
+    designed = task_of_record(*of, task.options, chosen.simple(task))
     predicted = predicted_ms(designed, rule_named(task.rule))
     return replace(chosen.alone, predicted=predicted)
 
@@ -353,10 +354,11 @@ def _judged(
     if judgement.verdict is Verdict.NONE:
         return _without_gains(found, judgement)
     tuning.tell("designing the gains")
-    options = tuning.task.options
-    task = task_of_record(found, options, tuning.simple, tuning.rng, beside)
+    record, options = found.record, tuning.task.options
+    task = task_of_record(chosen, record, found.cycles, options, tuning.simple, tuning.rng, beside)
     shaping = Shaping(task, evidence, findings)
-    found = replace(warned_of_rows(found, options), shaping=shaping)
+    chosen = warned_of_rows(chosen, record, options)
+    found = replace(found, models=(chosen, *others), shaping=shaping)
     tuned = _tuned(found, task, tuning.rules)
     gains = tuned.best_gains
     if gains is None:

@@ -13,12 +13,12 @@ import numpy as np
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.judgement.difference import Difference
+from relay_autotune.identification.result import Identification
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.quantities import LONGEST, SHORTEST
 from relay_autotune.record.cycles import limit_cycle
-from relay_autotune.record.record import Record
-from relay_autotune.result import Analysis
+from relay_autotune.record.record import Cycle, Record
 from relay_autotune.text import digits
 from relay_autotune.tuning.ensemble import DRAWS, ensemble
 from relay_autotune.tuning.rules.formulas import describing_point_of_cycle
@@ -26,26 +26,30 @@ from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 
 def task_of_record(
-    found: Analysis,
+    chosen: Identification,
+    record: Record,
+    cycles: Sequence[Cycle],
     options: DesignOptions,
     simple: TransferFunction | None,
     rng: np.random.Generator | None = None,
     beside: Difference | None = None,
 ) -> DesignTask:
-    """Return what the rules are given for the selected model of an analysis.
+    """Return what the rules are given for the selected model of a record.
 
-    :param found: the analysis.
+    :param chosen: that model.
+    :param record: the record.
+    :param cycles: its whole cycles.
     :param options: as they were given.
     :param simple: the FOPDT that most rules need; None: there is none.
     :param rng: draws the models within the uncertainty; None: of a fixed seed.
     :param beside: what the record shows beside the model; None: it was not asked.
     """
-    chosen, rng = found.models[0], rng or np.random.default_rng(0)
-    given, options = options, _with_noise(options, found)
+    rng = rng or np.random.default_rng(0)
+    given, options = options, _with_noise(options, chosen, record)
     models = ensemble(chosen, rng=rng)
     if beside is not None and not models:
         models = (chosen.model,) * DRAWS
-    unseen = _unseen(found.record, given)
+    unseen = _unseen(record, given)
     if unseen:
         options = replace(options, loop_delay=options.loop_delay + 0.5 * unseen)
         models = _spread_in_time(models, unseen, rng)
@@ -55,14 +59,13 @@ def task_of_record(
         simple=simple,
         models=models,
         errors=None if beside is None else beside.draws(len(models), rng),
-        describing=_describing_point(found),
-        recorded_period=_clock_of(found.record),
+        describing=_describing_point(record, cycles, chosen.model.process_sign),
+        recorded_period=_clock_of(record),
     )
 
 
-def _with_noise(options: DesignOptions, found: Analysis) -> DesignOptions:
+def _with_noise(options: DesignOptions, chosen: Identification, record: Record) -> DesignOptions:
     """Take noise, amplitude and sampling period from the record if they are not given."""
-    record, chosen = found.record, found.models[0]
     # The controller will see single samples, not means of many.
     before = record.unthinned
     if math.isnan(options.noise_std):
@@ -112,23 +115,24 @@ def _spread_in_time(
     )
 
 
-def warned_of_rows(found: Analysis, options: DesignOptions) -> Analysis:
-    """Add to the selected model's warnings what its record does not show of the command.
+def warned_of_rows(
+    chosen: Identification, record: Record, options: DesignOptions
+) -> Identification:
+    """Add to a model's warnings what its record does not show of the command.
 
-    :param found: the analysis.
+    :param chosen: the model.
+    :param record: the record.
     :param options: as they were given.
     """
-    unseen = _unseen(found.record, options)
+    unseen = _unseen(record, options)
     if not unseen:
-        return found
+        return chosen
     told = (
         f"a change of the command may have come up to {digits(unseen, 3)} s before its row, "
         "since the controller is to run more often than these were written: the gains allow "
         "for as much more dead time; log faster, or add a row at each change"
     )
-    chosen, *others = found.models
-    chosen = replace(chosen, warnings=(*chosen.warnings, told))
-    return replace(found, models=(chosen, *others))
+    return replace(chosen, warnings=(*chosen.warnings, told))
 
 
 def sampling_period(record: Record) -> float:
@@ -147,19 +151,15 @@ def sampling_period(record: Record) -> float:
     return period
 
 
-def _describing_point(found: Analysis) -> UltimatePoint | None:
+def _describing_point(record: Record, cycles: Sequence[Cycle], sign: int) -> UltimatePoint | None:
     """Return the describing function's ultimate point of the limit cycle; None without cycle."""
-    settings = found.record.settings
-    if not found.cycles or settings is None:
+    settings = record.settings
+    if not cycles or settings is None:
         return None
-    cycle = limit_cycle(found.cycles)
+    cycle = limit_cycle(cycles)
     amplitude = 0.5 * (cycle.peak_max - cycle.peak_min)
     if not amplitude > 0.0:
         return None
     return describing_point_of_cycle(
-        cycle.period,
-        cycle.period_high,
-        amplitude,
-        settings.amplitude,
-        found.models[0].model.process_sign,
+        cycle.period, cycle.period_high, amplitude, settings.amplitude, sign
     )

@@ -107,7 +107,7 @@ def test_a_joint_under_a_trajectory_controller_is_tuned_opened_alone(rig: Rig) -
     assert "arm_controller off and forward_arm on, in one strict request" in said
     assert "moves the effort of arm_2 itself, about" in said
     assert "gains.arm_2.p/i/d at once, read back, not verified by a step" in said
-    assert "control_toolbox_legacy, every 10 ms" in said
+    assert "control_toolbox_legacy_velocity, every 10 ms" in said
     assert arm.history() == ["arm_controller"]
 
 
@@ -128,7 +128,7 @@ def test_a_joint_under_a_trajectory_controller_gets_gains_and_its_controller_bac
     assert "p {:.6g}, i {:.6g}, d {:.6g}; before: p 6, i 0, d 0".format(*after) in said
     assert "not verified its references are trajectories: give it a short trajectory" in said
     assert "--once /arm_controller/joint_trajectory trajectory_msgs/msg/JointTrajectory" in said
-    assert "Designed for control_toolbox_legacy every 0.01 s" in file.read_text()
+    assert "Designed for control_toolbox_legacy_velocity every 0.01 s" in file.read_text()
     # A twentieth of -1.3 to 0.7, towards the middle, and the other joint stays.
     line = next(line for line in done.log.splitlines() if "ros2 topic pub" in line)
     went = follows(rig, line)
