@@ -186,6 +186,9 @@ def check_output(program: str, output: str) -> None:
         raise SelectionError(
             f"{path} exists and is not a report of this package; name another file, or remove it"
         )
+    if path.suffix.lower() == ".html":
+        # A package that is missing is told here, too.
+        import relay_autotune.report.page  # noqa: F401
     try:
         # Only an attempt tells of rights, of file systems and of the length of names.
         with path.open("ab"):
