@@ -92,8 +92,10 @@ def test_a_log_has_a_line_each_ten_seconds_and_at_once_what_takes_longer(
     # ten seconds and less than one, two hundred times faster
     monkeypatch.setattr(terminal, "LOGGED_EVERY", 0.2)
     monkeypatch.setattr(terminal, "TOLD_EVERY", 0.004)
-    with Working("the work", expected) as working:
-        working.at("comparing")
+    # Its thread may speak before anything that follows.
+    work = Working("the work", expected)
+    work.at("comparing")
+    with work:
         for _ in range(1000):
             lines = capsys.readouterr().err.splitlines()
             if lines:
