@@ -235,6 +235,16 @@ class Identification:
         """The transfer function."""
         return self.estimate.model
 
+    def felt(self, command: FloatArray, first: float) -> FloatArray:
+        """Return commands as the model feels them, whose effects above and below one may differ.
+
+        :param command: u, shape (n,).
+        :param first: the first command of the record [u].
+        """
+        away = command - first
+        above, below = self.effects
+        return np.asarray(first + np.where(away > 0.0, above, below) * away)
+
     @property
     def why_chosen(self) -> str:
         """Why it was taken before rivals of more support, a sentence; empty: there are none."""

@@ -13,6 +13,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification
+from relay_autotune.identification.waveform.posterior import DRAWS
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import ControlLaw
 from relay_autotune.loop.stability import at_infinity, winding
@@ -21,8 +22,6 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.candidates import allowed_outside
 from relay_autotune.tuning.rules import Rule
 from relay_autotune.tuning.task import DesignTask
-
-DRAWS = 100
 
 
 def ensemble(

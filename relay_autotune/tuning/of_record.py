@@ -14,13 +14,14 @@ import numpy as np
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.judgement.difference import Difference
 from relay_autotune.identification.result import Identification
+from relay_autotune.identification.waveform.posterior import DRAWS
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.quantities import LONGEST, SHORTEST
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Cycle, Record
 from relay_autotune.text import digits
-from relay_autotune.tuning.ensemble import DRAWS, ensemble
+from relay_autotune.tuning.ensemble import ensemble
 from relay_autotune.tuning.rules.formulas import describing_point_of_cycle
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 

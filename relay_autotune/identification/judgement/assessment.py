@@ -315,24 +315,15 @@ def _validated(found: Identification, seen: Fold | None, record: Record) -> Vali
         return None
     try:
         rest = steady_state(record, seen.settings)
-        felt = _felt(seen.settings, found.effects, record.input().initial)
+        felt = _felt(seen.settings, found, record.input().initial)
         return validate_fold(found.model, replace(seen, settings=felt), rest)
     except IdentificationError as error:
         return Validation(reason=str(error))
 
 
-def _felt(settings: RelaySettings, effects: tuple[float, float], first: float) -> RelaySettings:
-    """Return the relay whose equal effects are those that a process feels of one.
-
-    :param settings: of the relay.
-    :param effects: of commands above and below the first one, relative to the model.
-    :param first: that command [u].
-    """
-    above, below = effects
-    low, high = (
-        first + (above if level > first else below) * (level - first)
-        for level in (settings.low, settings.high)
-    )
+def _felt(settings: RelaySettings, found: Identification, first: float) -> RelaySettings:
+    """Return the relay whose equal effects are those that a process feels of one."""
+    low, high = found.felt(np.array([settings.low, settings.high]), first).tolist()
     bias = 0.5 * (high + low) - settings.baseline
     return replace(settings, amplitude=0.5 * (high - low), bias=bias)
 

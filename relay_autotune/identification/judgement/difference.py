@@ -26,6 +26,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.result import Identification
+from relay_autotune.identification.waveform.posterior import DRAWS
 from relay_autotune.identification.waveform.residuals import Colour, colour_of
 from relay_autotune.process.model_set import ModelErrors
 from relay_autotune.process.response import response
@@ -39,9 +40,8 @@ _DECAY = 3.0
 # Ratios of the powers of difference and noise, of which the most likely one is taken.
 _RATIOS = np.concatenate(([0.0], np.geomspace(1e-3, 1e12, 61)))
 _TURNS = 2
-# Draws of the difference for the ultimate point, which is sought up to this factor from the
-# model's, at so many frequencies.
-_DRAWN, _FAR, _NEAR = 100, 4.0, 241
+# Largest factor of an ultimate point from the model's, and frequencies at which it is sought.
+_FAR, _NEAR = 4.0, 241
 # Shares below which a direction of the nuisances, and the square of one of the increments, are
 # those of rounding.
 _DEPENDENT, _ROUNDING = 1e-9, 1e-13
@@ -88,7 +88,7 @@ def widened(found: Identification, beside: Difference | None) -> Identification:
     model, own = found.model, found.ultimate_frequency
     w = own * np.geomspace(1.0 / _FAR, _FAR, _NEAR)
     alone = model(1j * w)[:, None]
-    ratio = 1.0 + beside.draws(_DRAWN, np.random.default_rng(0))(1j * w) / alone
+    ratio = 1.0 + beside.draws(DRAWS, np.random.default_rng(0))(1j * w) / alone
     phase = model.phase(w)[:, None] + np.unwrap(np.angle(ratio), axis=0)
     size = np.log(np.abs(alone * ratio)) + math.log(abs(found.ultimate_gain))
     away = np.log(w / own)
@@ -97,13 +97,11 @@ def widened(found: Identification, beside: Difference | None) -> Identification:
     crossed = above[:-1] & ~above[1:]
     far = np.where(crossed, np.abs(away[:-1])[:, None], math.inf)
     none = np.where(above[-1], w.size - 2, 0)
-    cell, each = np.where(crossed.any(axis=0), far.argmin(axis=0), none), np.arange(_DRAWN)
+    cell, each = np.where(crossed.any(axis=0), far.argmin(axis=0), none), np.arange(DRAWS)
     before, after = phase[cell, each], phase[cell + 1, each]
     share = np.clip((before + math.pi) / (before - after), 0.0, 1.0)
-    sizes, times = (
-        (1.0 - share) * curve[cell, each] + share * curve[cell + 1, each]
-        for curve in (size, np.repeat(away[:, None], _DRAWN, axis=1))
-    )
+    sizes = (1.0 - share) * size[cell, each] + share * size[cell + 1, each]
+    times = (1.0 - share) * away[cell] + share * away[cell + 1]
     gain = found.ultimate_gain * math.sqrt(float(np.mean(sizes**2)))
     frequency = own * math.sqrt(float(np.mean(times**2)))
     return replace(
@@ -133,10 +131,7 @@ def _difference(found: Identification, record: Record) -> Difference | None:
     u = record.input()
     few = np.unique(np.linspace(0, len(record) - 1, _MOST_COMPARED).astype(np.int64))
     time = record.time[few]
-    away = u.values - u.initial
-    above, below = found.effects
-    acting = replace(u, values=u.initial + np.where(away > 0.0, above, below) * away)
-    answer = response(model, time, acting)
+    answer = response(model, time, replace(u, values=found.felt(u.values, u.initial)))
     # The measurement's zero and the command before the record are not known.
     before = response(model, time, PiecewiseConstant(time[:1], np.ones(1), 0.0))
     beside = [np.ones(time.size), before]
