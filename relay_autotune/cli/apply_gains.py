@@ -42,7 +42,7 @@ from relay_autotune.text import digits, duration
 
 if TYPE_CHECKING:
     from relay_autotune.loop.gains import Controller
-    from relay_autotune.nodes.gains_client import GainsClient
+    from relay_autotune.nodes.gains_client import GainsClient, StepsHere
     from relay_autotune.nodes.loop_client import LoopClient
 
 PROGRAM = "apply_gains"
@@ -181,14 +181,15 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
         if client.has(gains):
             raise TuningError("the new gains are in force already: give --verify-only for a step")
         print("\n".join(beside(present, gains, model, width())))
-    step = 0.0 if options.no_verify else options.step or _usual_step(client, options)
+    steps = client.steps()
+    step = 0.0 if options.no_verify else options.step or _usual_step(client, steps, options)
     tried = present if options.verify_only else gains
     if step and tried is not None:
         with Working("computing which steps the limits allow"):
-            allowed = client.allowed_steps(tried)
+            allowed = steps.allowed(tried)
             step = options.step or allowed.nearest(step)
             allowed.require(step)
-            expected = "" if options.load else client.expected(tried, step)
+            expected = "" if options.load else steps.expected(tried, step)
     question = _question(options, step)
     if step and tried is not None and not options.yes:
         agreed = bool(step := agreed_step(f"{question} {expected}".strip(), step, allowed))
@@ -249,10 +250,10 @@ def verified(
     return result, entries
 
 
-def _usual_step(client: GainsClient, options: argparse.Namespace) -> float:
+def _usual_step(client: GainsClient, steps: StepsHere, options: argparse.Namespace) -> float:
     if options.load and not client.values(client.name, ["verify_step"])["verify_step"]:
         return 0.0
-    step = client.usual_step()
+    step = steps.usual()
     if step is None:
         raise LoopError("the height of the step is not known: give --step")
     return step

@@ -484,7 +484,7 @@ class GainsPage:
                 present = controller.in_force()
                 # It comes of the record of the tune, which is large.
                 if self._step is None:
-                    self._step = controller.usual_step() or math.nan
+                    self._step = controller.steps().usual() or math.nan
             except RelayAutotuneError:
                 # It may be about to end: the next look tells.
                 self._looked = time.monotonic()
@@ -551,12 +551,12 @@ class GainsPage:
                     told = controller.put_in_force(message)
                     live.rest(f"{told}; they are not verified", good=True)
                     return
-                controller.allowed_steps(gains_from_message(message)).require(wish.step)
+                controller.steps().allowed(gains_from_message(message)).require(wish.step)
                 with controller.offered(message) as gains:
                     self._verify(wish, controller, gains)
                 return
             if (present := controller.in_force()) is not None:
-                controller.allowed_steps(present).require(wish.step)
+                controller.steps().allowed(present).require(wish.step)
             self._verify(wish, controller, None)
 
     def _prove(self, wish: PageCommand) -> None:

@@ -10,6 +10,7 @@ import shlex
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cached_property
 from typing import Any
 
 from action_msgs.msg import GoalStatus
@@ -226,68 +227,9 @@ class GainsClient(LoopClient):
         finally:
             self.set_values(self.name, before)
 
-    def step_choice(self) -> StepChoice | None:
-        """Return what decides the step that proves gains; None: no tune has left its record.
-
-        :raises RelayAutotuneError: if its model is not there.
-        """
-        found = self.latched(
-            RelayExperiment, "relay_experiment", lambda m: len(m.cycle_start) > 1, _RESULT_WITHIN
-        )
-        if found is None:
-            return None
-        low, high, least, most = self.values(self.name, LIMITS).values()
-        return StepChoice(
-            record_from_message(found), self.model(), Limits(low, high), Limits(least, most),
-            self.noise(),
-        )  # fmt: skip
-
-    def usual_step(self) -> float | None:
-        """Return the step of the node, else the one that proves most within its limits [y].
-
-        None: neither is known.
-        """
-        if given := self.values(self.name, ["verify_step"])["verify_step"]:
-            return float(given)
-        choice = self.step_choice()
-        return choice.best or None if choice else None
-
-    def allowed_steps(self, gains: Controller) -> StepRange:
-        """Return the steps of the set-point that the limits of the node allow.
-
-        Without the record of a tune it is not known where the loop rests: the node alone refuses.
-
-        :param gains: those that are to make the step.
-        :raises RelayAutotuneError: if the model is not there, or the loop would be unstable.
-        """
-        choice = self.step_choice()
-        if choice is None:
-            return StepRange()
-        return choice.allowed(choice.plan(self._control(gains), 1.0))
-
-    def expected(self, gains: Controller, step: float) -> str:
-        """Say what a step of the set-point will do; empty: no tune has left its record.
-
-        :param gains: those that are to make the step.
-        :param step: y.
-        :raises RelayAutotuneError: as :meth:`allowed_steps`.
-        """
-        if (choice := self.step_choice()) is None:
-            return ""
-        wanted = choice.plan(self._control(gains), step)
-        return (
-            f"The command is expected {choice.expected(wanted)}, for about "
-            f"{duration(wanted.duration)}."
-        )
-
-    def _control(self, gains: Controller) -> Control:
-        """Return gains as they run in the node that controls."""
-        values = self.values(self.name, ("law", "law_period", "apply_to", "apply_feedforward"))
-        if not values["apply_to"]:
-            return Control(gains, rate_from(values))
-        newest, _ = self.waiting()
-        rate = rate_of(newest.law, newest.law_period)
-        return in_another_node(gains, rate, values["apply_feedforward"])
+    def steps(self) -> StepsHere:
+        """Return the steps that may prove gains here."""
+        return StepsHere(self)
 
     def prove(
         self,
@@ -433,3 +375,76 @@ class GainsClient(LoopClient):
                 raise GoneError(f"{self.name} has gone during the verification")
             if time.monotonic() >= until:
                 raise GoneError(f"{self.name} has not ended the verification")
+
+
+class StepsHere:
+    """The steps of the set-point that may prove gains of a controller_node.
+
+    They follow from the record of its tune, which is large and is asked for once.
+
+    :param client: of the node, which was found.
+    """
+
+    def __init__(self, client: GainsClient) -> None:
+        self._client = client
+
+    @cached_property
+    def _choice(self) -> StepChoice | None:
+        """What decides the step; None: no tune has left its record."""
+        client = self._client
+        found = client.latched(
+            RelayExperiment, "relay_experiment", lambda m: len(m.cycle_start) > 1, _RESULT_WITHIN
+        )
+        if found is None:
+            return None
+        low, high, least, most = client.values(client.name, LIMITS).values()
+        return StepChoice(
+            record_from_message(found), client.model(), Limits(low, high), Limits(least, most),
+            client.noise(),
+        )  # fmt: skip
+
+    def usual(self) -> float | None:
+        """Return the step of the node, else the one that proves most within its limits [y].
+
+        :raises RelayAutotuneError: if the model is not there.
+        """
+        if given := self._client.values(self._client.name, ["verify_step"])["verify_step"]:
+            return float(given)
+        return self._choice.best or None if self._choice else None
+
+    def allowed(self, gains: Controller) -> StepRange:
+        """Return the steps that the limits of the node allow.
+
+        Without the record of a tune it is not known where the loop rests: the node alone refuses.
+
+        :param gains: those that are to make the step.
+        :raises RelayAutotuneError: if the model is not there, or the loop would be unstable.
+        """
+        if self._choice is None:
+            return StepRange()
+        return self._choice.allowed(self._choice.plan(self._control(gains), 1.0))
+
+    def expected(self, gains: Controller, step: float) -> str:
+        """Say what a step will do; empty: no tune has left its record.
+
+        :param gains: those that are to make the step.
+        :param step: y.
+        :raises RelayAutotuneError: as :meth:`allowed`.
+        """
+        if self._choice is None:
+            return ""
+        wanted = self._choice.plan(self._control(gains), step)
+        return (
+            f"The command is expected {self._choice.expected(wanted)}, for about "
+            f"{duration(wanted.duration)}."
+        )
+
+    def _control(self, gains: Controller) -> Control:
+        """Return gains as they run in the node that controls."""
+        client, names = self._client, ("law", "law_period", "apply_to", "apply_feedforward")
+        values = client.values(client.name, names)
+        if not values["apply_to"]:
+            return Control(gains, rate_from(values))
+        newest, _ = client.waiting()
+        rate = rate_of(newest.law, newest.law_period)
+        return in_another_node(gains, rate, values["apply_feedforward"])

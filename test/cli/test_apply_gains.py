@@ -147,9 +147,11 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     asked: list[str] = []
     client: Any = SimpleNamespace(
         in_force=lambda: None, model=lambda: MODEL, noise=lambda: 0.01,
-        waiting=lambda: (GAINS, ""), has=lambda gains: False, usual_step=lambda: 3.0,
-        ask=asked.append, expected=lambda gains, step: f"The command goes to {step:g} u.",
-        allowed_steps=lambda gains: StepRange(-1.5, 2.0 if gains is GAINS else 0.0),
+        waiting=lambda: (GAINS, ""), has=lambda gains: False, ask=asked.append,
+        steps=lambda: SimpleNamespace(
+            usual=lambda: 3.0, expected=lambda gains, step: f"The command goes to {step:g} u.",
+            allowed=lambda gains: StepRange(-1.5, 2.0 if gains is GAINS else 0.0),
+        ),
         values=lambda node, names: {"verify_step": 0.0}, name="controller_node",
     )  # fmt: skip
     given = apply_gains._parser().parse_args(["--yes", "--step", "2.5"])
@@ -173,8 +175,10 @@ def client_of(prove: Any, in_force: Any) -> Any:
     return SimpleNamespace(
         in_force=in_force, model=lambda: MODEL, noise=lambda: 0.01,
         waiting=lambda: (GAINS, ""), has=lambda gains: in_force() is gains,
-        allowed_steps=lambda gains: StepRange(), name="controller_node", prove=prove,
-        expected=lambda gains, step: "",
+        steps=lambda: SimpleNamespace(
+            allowed=lambda gains: StepRange(), expected=lambda gains, step: ""
+        ),
+        name="controller_node", prove=prove,
         values=lambda node, names: {"verify_step": 0.0},
     )  # fmt: skip
 
@@ -222,7 +226,8 @@ def gone(present: list[Any]) -> Any:
 def test_the_page_refuses_a_step_beyond_the_limits_before_anything_changes() -> None:
     changed: list[Any] = []
     controller: Any = SimpleNamespace(
-        in_force=lambda: Controller(0.1, 3.0), allowed_steps=lambda gains: StepRange(-1.5, 2.0),
+        in_force=lambda: Controller(0.1, 3.0),
+        steps=lambda: SimpleNamespace(allowed=lambda gains: StepRange(-1.5, 2.0)),
         offered=changed.append, prove=lambda *words: changed.append(words),
     )  # fmt: skip
     live: Any = SimpleNamespace(tell=lambda **told: None, show=lambda *shown: None)
