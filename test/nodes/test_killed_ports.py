@@ -28,7 +28,8 @@ def until(condition: Callable[[], bool], what: str) -> None:
 
 
 def opens(pid: int, path: Path) -> bool:
-    return any(link.readlink() == path for link in Path(f"/proc/{pid}/fd").iterdir())
+    # A file may be closed meanwhile.
+    return any(os.path.realpath(link) == str(path) for link in Path(f"/proc/{pid}/fd").iterdir())
 
 
 @pytest.mark.parametrize("left", [b"", bytes(52400)], ids=["not sized", "not made ready"])
