@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -28,8 +29,12 @@ def until(condition: Callable[[], bool], what: str) -> None:
 
 
 def opens(pid: int, path: Path) -> bool:
-    # A file may be closed meanwhile.
-    return any(os.path.realpath(link) == str(path) for link in Path(f"/proc/{pid}/fd").iterdir())
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        # A file may be closed meanwhile.
+        with suppress(FileNotFoundError):
+            if link.readlink() == path:
+                return True
+    return False
 
 
 @pytest.mark.parametrize("left", [b"", bytes(52400)], ids=["not sized", "not made ready"])
