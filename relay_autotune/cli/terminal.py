@@ -25,7 +25,7 @@ from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError
 from relay_autotune.text import LOGGED_EVERY, TOLD_EVERY, duration, in_units, visible
 
 if TYPE_CHECKING:
-    from relay_autotune.control.verification import StepRange
+    from relay_autotune.control.step_choice import StepRange
 
 
 # Longer lines are hard to read, also where the terminal is wider.

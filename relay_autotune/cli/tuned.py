@@ -28,7 +28,8 @@ from relay_autotune.cli.own_nodes import (
 from relay_autotune.cli.terminal import UNITS, WIDEST, Working
 from relay_autotune.cli.tune_view import Paint, result_lines
 from relay_autotune.control.controller import Control
-from relay_autotune.control.verification import StepChoice, noise_of
+from relay_autotune.control.step_choice import StepChoice
+from relay_autotune.control.verification import noise_of
 from relay_autotune.errors import TuningError
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
 from relay_autotune.loop.gains import Gains

@@ -19,7 +19,6 @@ from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.sampled import UNLIMITED, Limits
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code, Reason
-from relay_autotune.record.record import Record
 
 # A response has settled when it stays within this part of its largest deviation.
 SETTLED = 0.05
@@ -41,15 +40,6 @@ RUNAWAY = 3.0
 
 # A comparison that takes more than this part of its tolerance passes narrowly.
 _NARROW = 0.75
-
-# The step that proves most: multiples of the tune's swing and of the noise, whichever is larger;
-# and the multiple at which the noise does not decide the overshoot, if it takes but a part of the
-# way to a limit.
-_OF_SWING = 0.5
-_OF_NOISE = 20.0
-_CLEAR_OF_NOISE, _OF_WIDE_ROOM = 40.0, 1.0 / 3.0
-# Part of the way to a limit that a step may go, for its overshoot.
-_OF_ROOM = 0.8
 
 # A sensor whose samples are this many periods of a law apart leaves runs of it out.
 _SLOWER_SENSOR = 1.2
@@ -75,55 +65,6 @@ class Step:
 
     setpoint: float = 0.0
     load: float = 0.0
-
-
-@dataclass(frozen=True)
-class StepRange:
-    """The steps of a set-point that the limits allow.
-
-    :param low: lowest step [y].
-    :param high: highest one [y].
-    :param least: smallest magnitude with which the noise does not decide [y].
-    """
-
-    low: float = -math.inf
-    high: float = math.inf
-    least: float = 0.0
-
-    @property
-    def words(self) -> str:
-        """Which steps are allowed, and why."""
-        said = "other than 0"
-        if math.isfinite(self.high - self.low):
-            said = (
-                f"from {self.low:g} to {self.high:g} y: the limits allow no more, with the "
-                f"overshoot that the model predicts"
-            )
-        return said + (f"; {_least_text(self.least, 'y')}" if self.least > 0.0 else "")
-
-    def allows(self, step: float) -> bool:
-        """Return whether a step is within the range, and not 0.
-
-        :param step: y.
-        """
-        return step != 0.0 and self.low <= step <= self.high and abs(step) >= self.least
-
-    def nearest(self, step: float) -> float:
-        """Return the step that the limits allow and that is nearest to one [y].
-
-        :param step: y.
-        """
-        visible = math.copysign(max(abs(step), self.least), step)
-        return min(max(visible, self.low), self.high)
-
-    def require(self, step: float) -> None:
-        """Refuse a step.
-
-        :param step: y.
-        :raises TuningError: if it is outside.
-        """
-        if not self.allows(step):
-            raise TuningError(f"the step of the set-point is {step:g} y, expected {self.words}")
 
 
 @dataclass(frozen=True)
@@ -202,10 +143,15 @@ class Plan:
         height, unit = (step.setpoint, "y") if step.setpoint else (step.load, "u")
         least = rounded_up(self.visible * noise_std)
         if abs(height) < least:
-            raise TuningError(f"the step is {height:g} {unit}: {_least_text(least, unit)}")
+            raise TuningError(f"the step is {height:g} {unit}: {least_text(least, unit)}")
 
 
-def _least_text(least: float, unit: str) -> str:
+def least_text(least: float, unit: str) -> str:
+    """Say which steps the noise hides.
+
+    :param least: the least step that it does not hide.
+    :param unit: of the step.
+    """
     return f"with the noise of the measurement, less than {least:g} {unit} cannot be judged"
 
 
@@ -216,113 +162,6 @@ def noise_of(noise_std: float, residual_rms: float) -> float:
     :param residual_rms: what the model leaves of the measurement [y].
     """
     return float(np.fmax(noise_std, residual_rms))
-
-
-@dataclass(frozen=True)
-class StepChoice:
-    """What decides the step of the set-point that is to prove gains after a tune.
-
-    :param record: of the tune, with its settings; the loop rests about its set-point and mean
-        command.
-    :param model: the process.
-    :param measurement: its range [y].
-    :param command: its range [u].
-    :param noise_std: of :func:`noise_of` [y].
-    """
-
-    record: Record
-    model: TransferFunction
-    measurement: Limits
-    command: Limits
-    noise_std: float
-
-    @property
-    def _noise(self) -> float:
-        return 0.0 if math.isnan(self.noise_std) else self.noise_std
-
-    @property
-    def best(self) -> float:
-        """The step that proves gains best [y], in two digits; 0: not known.
-
-        It is half of the swing that the tune made, at least twenty times the noise, upward if the
-        limits allow; the process then rests at most at 0.8 of the way to a limit. It is forty
-        times the noise if that is a third of the way at most.
-        """
-        record = self.record
-        if record.settings is None or len(record.cycle_start) < 2:
-            return 0.0
-        first, stop = record.cycle_start[-2:]
-        swing = 0.5 * float(np.ptp(record.measurement[first : stop + 1]))
-        wanted = max(_OF_SWING * swing, _OF_NOISE * self._noise)
-        down, up = self._ways
-        sign = 1.0 if _OF_ROOM * up >= wanted or up >= down else -1.0
-        room = max(up if sign > 0.0 else down, 0.0)
-        clear = min(_CLEAR_OF_NOISE * self._noise, _OF_WIDE_ROOM * room)
-        height = max(min(wanted, _OF_ROOM * room), clear)
-        return sign * float(f"{height:.2g}")
-
-    def plan(self, control: Control, step: float) -> Plan:
-        """Return the plan of a step of the set-point.
-
-        :param control: the gains, and what runs them.
-        :param step: y.
-        :raises TuningError: as :func:`plan`.
-        """
-        return plan(control, self.model, Step(setpoint=step), self.record.mean_interval)
-
-    def allowed(self, wanted: Plan) -> StepRange:
-        """Return the steps that limits allow and noise does not hide, in two digits.
-
-        The predicted peak, with an allowance for the noise, stays within the limits of the
-        measurement, and the command can hold the new set-point.
-
-        :param wanted: for a step of the set-point by 1.
-        """
-        assert self.record.settings is not None
-        setpoint, spared = self.record.settings.setpoint, NOISE_ALLOWANCE * self._noise
-        low, high = setpoint - self.measurement.low, self.measurement.high - setpoint
-        down, up = self._ways
-        return StepRange(
-            0.0 - _rounded_down(min(down, (low - spared) / wanted.peak)),
-            _rounded_down(min(up, (high - spared) / wanted.peak)),
-            rounded_up(wanted.visible * self._noise),
-        )
-
-    def expected(self, wanted: Plan) -> str:
-        """Return the predicted range of the command with a step, for people.
-
-        :param wanted: for the step.
-        """
-        assert self.record.settings is not None
-        rest = self.record.settings.baseline
-        low, high = (self.command.clip(rest + end) for end in wanted.command)
-        return f"from {low:.3g} to {high:.3g} u"
-
-    @property
-    def _ways(self) -> tuple[float, float]:
-        """How far below and above its set-point the loop can rest [y]."""
-        record, model = self.record, self.model
-        assert record.settings is not None
-        setpoint = record.settings.setpoint
-        down, up = setpoint - self.measurement.low, self.measurement.high - setpoint
-        if model.integrators == 0:
-            baseline = record.settings.baseline
-            if len(record.cycle_start) > 1:
-                first, stop = record.cycle_start[-2:]
-                baseline = float(np.mean(record.command[first:stop]))
-            ends = sorted(
-                model.gain * (end - baseline) for end in (self.command.low, self.command.high)
-            )
-            down, up = min(down, -ends[0]), min(up, ends[1])
-        return down, up
-
-
-def _rounded_down(value: float) -> float:
-    """Return a number in two digits that is at most a value, 0 for a negative one."""
-    if not 0.0 < value < math.inf:
-        return max(value, 0.0)
-    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
-    return float(f"{math.floor(value / unit * (1.0 + 1e-9)) * unit:.2g}")
 
 
 def rounded_up(value: float) -> float:

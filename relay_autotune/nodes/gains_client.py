@@ -18,7 +18,8 @@ from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
 from relay_autotune.control.controller import Control
-from relay_autotune.control.verification import StepChoice, StepRange, noise_of
+from relay_autotune.control.step_choice import StepChoice, StepRange
+from relay_autotune.control.verification import noise_of
 from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import (
     gains_from_message,

@@ -42,7 +42,7 @@ from relay_autotune.cli.terminal import (
     pair_of,
 )
 from relay_autotune.cli.tune_page import _LoopOnPage
-from relay_autotune.control.verification import StepRange
+from relay_autotune.control.step_choice import StepRange
 from relay_autotune.errors import LoopError, ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS, Target, exported
 from relay_autotune.exchange.messages import fill_gains, fill_reason

@@ -16,10 +16,9 @@ from fopdt_plant import FopdtPlant
 from scipy.integrate import solve_ivp
 
 from relay_autotune.control.controller import Control, GainBounds, PidController, run_loop
+from relay_autotune.control.step_choice import StepChoice, StepRange
 from relay_autotune.control.verification import (
     Step,
-    StepChoice,
-    StepRange,
     compare,
     describe,
     noise_of,
