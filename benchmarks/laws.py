@@ -31,7 +31,8 @@ import numpy as np
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import LAWS, Law, SampledLaw
+from relay_autotune.loop.law import Law, SampledLaw
+from relay_autotune.loop.laws import LAWS
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Plant

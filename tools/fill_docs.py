@@ -28,7 +28,7 @@ from pathlib import Path
 
 from relay_autotune.analysis import PARAMETERS as IDENTIFIER_PARAMETERS
 from relay_autotune.identification.judgement.table import CHECKS
-from relay_autotune.loop.laws import LAWS, Law
+from relay_autotune.loop.laws import LAWS, ProgramLaw
 from relay_autotune.nodes.plant import PARAMETERS as PLANT_PARAMETERS
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS, FIXED_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.quantities import Quantity
@@ -125,7 +125,7 @@ def laws_table(what: str) -> str:
 
     :param what: "programs", "equations" or "properties".
     """
-    columns: dict[str, dict[str, Callable[[Law], str]]] = {
+    columns: dict[str, dict[str, Callable[[ProgramLaw], str]]] = {
         "programs": {
             "program, in the version whose source was read": lambda law: law.program,
             "command": lambda law: law.command,

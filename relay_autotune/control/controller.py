@@ -27,7 +27,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import LawRate, RunningLaw, SampledLaw
+from relay_autotune.loop.law import LawRate, RunningLaw, SampledLaw
 from relay_autotune.loop.sampled import UNLIMITED, ClosedLoop, Limits, PidLaw, filter_matrices
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant

@@ -19,7 +19,7 @@ from typing import Any
 
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.loop.gains import Gains
-from relay_autotune.loop.laws import LAWS, OWN_LAW, Law
+from relay_autotune.loop.laws import LAWS, OWN_LAW, ProgramLaw
 from relay_autotune.quantities import result_fields
 from relay_autotune.text import in_units
 
@@ -129,7 +129,7 @@ def file_name(how: str) -> str:
     return f"{how}.{LAWS[how].ending}" if how in LAWS else _FILES[how]
 
 
-def parameters(gains: Gains, law: Law, target: Target) -> str:
+def parameters(gains: Gains, law: ProgramLaw, target: Target) -> str:
     """Return parameters of a controller of ros2_controllers for one degree of freedom.
 
     The file holds only one node, since `ros2 param load` applies every section to the node that
@@ -157,7 +157,7 @@ def parameters(gains: Gains, law: Law, target: Target) -> str:
     return "\n".join(lines) + "\n"
 
 
-def settings(gains: Gains, law: Law, target: Target) -> str:
+def settings(gains: Gains, law: ProgramLaw, target: Target) -> str:
     """Return gains as the settings of a law, a line each, in the words of its program.
 
     :param gains: what they are for.
@@ -222,7 +222,7 @@ def settings(gains: Gains, law: Law, target: Target) -> str:
     return _written(law, _comments(gains, told, law.remark), values)
 
 
-def _full_command(law: Law, target: Target) -> float:
+def _full_command(law: ProgramLaw, target: Target) -> float:
     """Return the command that is the largest of a program [u]; 0: commands are already its own.
 
     :raises SelectionError: if commands are beyond the program's, and of what they are a share is
@@ -319,13 +319,13 @@ def launch_file(gains: Gains, target: Target) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _written(law: Law, comments: list[str], values: Sequence[tuple[str, str]]) -> str:
+def _written(law: ProgramLaw, comments: list[str], values: Sequence[tuple[str, str]]) -> str:
     lines = [law.line.format(name=name, value=value) for name, value in values]
     parts = [*comments, *filter(None, [law.head]), *lines, *filter(None, [law.tail])]
     return "\n".join(parts) + "\n"
 
 
-def _values(gains: Gains, law: Law) -> list[tuple[str, str]]:
+def _values(gains: Gains, law: ProgramLaw) -> list[tuple[str, str]]:
     """Return the settings of a law as texts, those without a value left out."""
     at = law.at(gains, gains.law_period)
     return _texts((each.name, each.of(at)) for each in law.settings)

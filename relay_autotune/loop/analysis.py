@@ -37,7 +37,8 @@ from relay_autotune.loop.gains import (
     Performance,
     StepFigures,
 )
-from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate, SampledLaw
+from relay_autotune.loop.law import LawRate, SampledLaw
+from relay_autotune.loop.laws import LAWS, OWN_LAW
 from relay_autotune.loop.stability import (
     closed_loop_unstable_poles,
     frequencies,

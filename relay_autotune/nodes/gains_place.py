@@ -24,7 +24,8 @@ from relay_autotune.control.controller import Control, is_usable
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.errors import FieldError, LoopError, NotReadyError, ParameterError, TuningError
 from relay_autotune.loop.gains import Controller, Gains
-from relay_autotune.loop.laws import LAWS, LawRate
+from relay_autotune.loop.law import LawRate
+from relay_autotune.loop.laws import LAWS
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.nodes.live_types import CommandMessage, reader_of

@@ -16,7 +16,8 @@ from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.early_end import SOUGHT, ULTIMATE_GAIN
 from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate
+from relay_autotune.loop.law import LawRate
+from relay_autotune.loop.laws import LAWS, OWN_LAW
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.quantities import Quantity
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import LawRate, Smoothing, taps_of
+from relay_autotune.loop.law import LawRate, Smoothing, taps_of
 from relay_autotune.loop.sampled import filter_elements
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import unstable_at_small_gain

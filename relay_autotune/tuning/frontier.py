@@ -43,7 +43,8 @@ from numpy.typing import NDArray
 
 from relay_autotune.arrays import ComplexArray, FloatArray, IntArray
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import CONTINUOUS, LawRate, polynomial
+from relay_autotune.loop.law import LawRate, polynomial
+from relay_autotune.loop.laws import CONTINUOUS
 from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import unstable_at_small_gain

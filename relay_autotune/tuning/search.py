@@ -32,7 +32,8 @@ from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop, abscissae, inverted
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import CONTINUOUS, LawRate, Slope
+from relay_autotune.loop.law import LawRate, Slope
+from relay_autotune.loop.laws import CONTINUOUS
 from relay_autotune.loop.stability import peaks
 from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction

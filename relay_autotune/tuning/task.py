@@ -16,7 +16,8 @@ from functools import cached_property
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller, Performance
-from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate, SampledLaw, Slope
+from relay_autotune.loop.law import LawRate, SampledLaw, Slope
+from relay_autotune.loop.laws import LAWS, OWN_LAW
 from relay_autotune.process.model_set import ModelErrors, ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint

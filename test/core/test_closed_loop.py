@@ -14,7 +14,8 @@ from scipy.linalg import expm
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop, analyse_loop
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate
+from relay_autotune.loop.law import LawRate
+from relay_autotune.loop.laws import LAWS, OWN_LAW
 from relay_autotune.loop.sampled import (
     Limits,
     SampledPid,

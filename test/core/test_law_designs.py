@@ -15,7 +15,8 @@ import pytest
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import LAWS, LawRate
+from relay_autotune.loop.law import LawRate
+from relay_autotune.loop.laws import LAWS
 from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.structures import INTEGRATOR_LAG, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction

@@ -18,7 +18,8 @@ from relay_autotune.control.verification import Step, compare, plan
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.laws import LAWS, LawRate
+from relay_autotune.loop.law import LawRate
+from relay_autotune.loop.laws import LAWS
 from relay_autotune.loop.sampled import Limits, SampledPid, simulate_closed_loop
 from relay_autotune.process.structures import INTEGRATOR_LAG
 from relay_autotune.process.transfer_function import TransferFunction

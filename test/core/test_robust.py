@@ -14,7 +14,8 @@ from worked_cases import PROCESSES, cases
 
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.loop.analysis import analyse_loop, is_stable
-from relay_autotune.loop.laws import LAWS, OWN_LAW, LawRate
+from relay_autotune.loop.law import LawRate
+from relay_autotune.loop.laws import LAWS, OWN_LAW
 from relay_autotune.process.structures import UNSTABLE_FOPDT, UNSTABLE_SOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import design

@@ -26,6 +26,7 @@ from relay_autotune.errors import LoopError
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.loop import laws
 from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.law import LawRate
 from relay_autotune.nodes import controller_manager
 from relay_autotune.nodes import joint_loop as joint_loop_module
 from relay_autotune.nodes.controller_manager import (
@@ -165,7 +166,7 @@ def test_a_step_of_a_joint_with_a_velocity_state_is_predicted_as_it_is_made() ->
         position += held * period + (velocity - held) * lag * (1.0 - left)
         velocity = held + (velocity - held) * left
     arm = Arm()
-    rate = laws.LawRate(laws.LAWS[joint_loop(arm, arm, "arm", "arm_2").law], period)
+    rate = LawRate(laws.LAWS[joint_loop(arm, arm, "arm", "arm_2").law], period)
     model = TransferFunction(1.0, (), (lag,), dead_time=0.03, integrators=1)
     control = in_another_node(gains, rate, 0.0)
     found = compare(control, model, Step(setpoint=1.0), period * np.arange(300), np.array(seen))
@@ -188,7 +189,7 @@ def test_the_strategies_differ_at_a_limit_of_the_command() -> None:
 
 
 def test_a_feedforward_is_a_weight_of_the_setpoint() -> None:
-    rate = laws.LawRate(laws.LAWS["control_toolbox_legacy"], 0.01)
+    rate = LawRate(laws.LAWS["control_toolbox_legacy"], 0.01)
     found = in_another_node(controller_of({"p": 0.5, "i": 1.0}), rate, 0.2)
     assert found.elsewhere and found.gains == Controller(0.5, 0.5, b=1.4)
     for setpoint, measured in ((2.0, 1.0), (-1.0, 0.3)):
