@@ -24,24 +24,23 @@ k L(j w) lies on Hall's circle of M. At one frequency that is a quadratic equati
 so that every frequency at which it has real roots forbids the gains between them. The gains
 forbidden by neighbouring frequencies join to intervals; the one that holds the ultimate gain ends
 below at the largest gain of a loop of that resonance. A loop with two integrators has a second
-interval that begins at zero, whose upper end is the lower solution: Luyben (2003) takes the
-upper.
+interval that begins at zero, whose upper end is the lower solution; Luyben (2003) takes the
+upper one, as here.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import brentq
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller, SeriesForm
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.scalar import minimum_near
+from relay_autotune.scalar import minimum_near, root
 from relay_autotune.tuning.rules.formulas import named, process_of, wants_pid
 from relay_autotune.tuning.task import DesignTask
 
@@ -49,20 +48,8 @@ _POINTS = 800
 _BELOW, _ABOVE = 1e-5, 30.0
 
 
-@dataclass(frozen=True)
-class ResonantGain:
-    """The gains at which a loop has a given resonance.
-
-    :param upper: the largest of them below the ultimate gain.
-    :param lower: the one at which slow oscillation ends; 0: there is none.
-    """
-
-    upper: float
-    lower: float
-
-
-def resonant_gain(loop: TransferFunction, decibels: float) -> ResonantGain:
-    """Return the factors on a loop that give its closed loop a resonance.
+def resonant_gain(loop: TransferFunction, decibels: float) -> float:
+    """Return the largest factor on a loop that gives its closed loop a resonance.
 
     :param loop: controller of gain 1 times process, with the sign that makes its feedback
         negative.
@@ -96,21 +83,14 @@ def resonant_gain(loop: TransferFunction, decibels: float) -> ResonantGain:
             "is too short, or its derivative time unsuitable"
         )
 
-    def refined(i: int, which: int, side: float) -> float:
-        """Return the least lower end (side 1) or the largest upper end (-1) near a frequency."""
-        ends = (low, high)[which]
+    if at < 0:
+        return upper
 
-        def end(log_w: float) -> float:
-            value = float(_roots(loop, np.array([math.exp(log_w)]), square)[which][0])
-            return 1e3 * ends[i] * max(side, 0.0) if math.isnan(value) else side * value
+    def end(log_w: float) -> float:
+        value = float(_roots(loop, np.array([math.exp(log_w)]), square)[0][0])
+        return 1e3 * upper if math.isnan(value) else value
 
-        return side * min(minimum_near(end, np.log(w), i, 1e-12)[1], side * ends[i])
-
-    lower = next((run for run in runs if high[run].max() < upper), None)
-    return ResonantGain(
-        upper if at < 0 else refined(at, 0, 1.0),
-        0.0 if lower is None else refined(int(lower[np.argmax(high[lower])]), 1, -1.0),
-    )
+    return min(minimum_near(end, np.log(w), at, 1e-12)[1], upper)
 
 
 def _grid(loop: TransferFunction, limit: float) -> FloatArray:
@@ -190,7 +170,7 @@ def luyben2003_p(task: DesignTask) -> tuple[Controller, str]:
     model = _process("luyben2003_p", task)
     if task.options.controller == "pid":
         raise TuningError("the rule luyben2003_p gives proportional action only")
-    size = resonant_gain(Controller(1.0, 0.0).loop(_direct(model)), task.options.resonance).upper
+    size = gain(model, 0.0, task.options.resonance)
     return Controller(model.process_sign * size, 0.0), (
         f"Luyben 2003: P only, the largest gain of +{task.options.resonance:g} dB; it leaves an "
         "offset after a load, as an ordinary level may have"
@@ -219,18 +199,18 @@ def integral_time(model: TransferFunction, phase_peak: float) -> float:
             f"the loop's phase never comes up to {math.degrees(phase_peak):.4g} degrees, "
             "whatever the integral time"
         )
-    return scale * math.exp(brentq(excess, low, high, xtol=1e-14, rtol=1e-14))
+    return scale * math.exp(root(excess, low, high, 1e-14))
 
 
 def gain(model: TransferFunction, ti: float, decibels: float) -> float:
-    """Return the size of kc whose PI loop has a closed-loop resonance, the upper one [u/y].
+    """Return the size of kc whose P or PI loop has a closed-loop resonance, the upper one [u/y].
 
     :param model: the process.
-    :param ti: integral time [s].
+    :param ti: integral time [s]; 0: proportional action alone.
     :param decibels: of the closed-loop log modulus [dB].
     :raises TuningError: if no gain has so small a resonance.
     """
-    return resonant_gain(Controller(1.0, ti).loop(_direct(model)), decibels).upper
+    return resonant_gain(Controller(1.0, ti).loop(_direct(model)), decibels)
 
 
 def derivative(
@@ -250,7 +230,7 @@ def derivative(
     def size(td: float) -> float:
         c = SeriesForm(1.0, short, td, alpha).isa()
         try:
-            return resonant_gain(c.loop(_direct(model)), decibels).upper
+            return resonant_gain(c.loop(_direct(model)), decibels)
         except TuningError:
             return 0.0
 

@@ -14,8 +14,6 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
-from scipy.optimize import brentq
-
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.identification.limit_cycle.shape import Shape, shape_of_half_cycle
 from relay_autotune.identification.methods.thyagarajan import (
@@ -27,6 +25,7 @@ from relay_autotune.identification.methods.thyagarajan import (
 )
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.scalar import root
 from relay_autotune.tuning.rules.formulas import (
     ITAE_RANGE,
     fopdt_of,
@@ -39,7 +38,7 @@ from relay_autotune.tuning.rules.formulas import (
     tyreus_luyben,
     wants_pid,
 )
-from relay_autotune.tuning.rules.luyben2003 import resonant_gain
+from relay_autotune.tuning.rules.luyben2003 import gain
 from relay_autotune.tuning.task import DesignTask
 
 RESONANCE = 3.0
@@ -84,7 +83,7 @@ def phase_margin(task: DesignTask) -> _Designed:
     high = 1.0 / ti
     while excess(high) > 0.0:
         high *= 2.0
-    w = float(brentq(excess, 0.0, high, xtol=1e-300, rtol=1e-14))
+    w = root(excess, 0.0, high)
     size = w * ti * math.prod(math.hypot(1.0, w * tau) for tau in lags) / math.hypot(1.0, w * ti)
     ratio = model.dead_time / max(lags)
     return Controller(size / model.gain, ti), (
@@ -112,11 +111,8 @@ def lcmax(task: DesignTask) -> _Designed:
         )
     wants_pid("lcmax", task, pid=False)
     ti = (n - 1) * lags[0]
-    direct = replace(model, gain=abs(model.gain))
-    size = resonant_gain(Controller(1.0, ti).loop(direct), RESONANCE).upper
-    return Controller(math.copysign(size, model.gain), ti), (
-        f"closed-loop resonance of 3 dB for {n} equal lags"
-    )
+    size = math.copysign(gain(model, ti, RESONANCE), model.gain)
+    return Controller(size, ti), (f"closed-loop resonance of 3 dB for {n} equal lags")
 
 
 def thyagarajan(task: DesignTask) -> _Designed:
