@@ -65,7 +65,7 @@ class Shaping:
             controller=gains,
             ms_around=np.empty(0) if around is None else ms_on_each(law, around),
             asked=max(self.task.options.ms, gains.ms),
-            pace_asked=self.task.options.given_closed_loop_time is not None,
+            pace_asked=not math.isnan(self.task.options.closed_loop_time),
         )
         found = judge(LOOP_CHECKS, replace(self.evidence, loop=loop))
         return Judgement((*self.findings, *found))

@@ -66,9 +66,8 @@ def dead_time_compensator(task: DesignTask) -> Compensator:
     :raises TuningError: for any other.
     """
     process = fopdt_of("dead_time_compensator", task)
-    default = DEAD_TIME_LAMBDA * process.time_constant
-    closed, why = _lambda(task, default, "2 tau (eq 51)")
-    model = TransferFunction.fopdt(process.gain, process.time_constant, process.dead_time)
+    closed, why = _lambda(task, DEAD_TIME_LAMBDA * process.lag, "2 tau (eq 51)")
+    model = TransferFunction.fopdt(process.gain, process.lag, process.delay)
     reason = f"dead-time compensator (eq 50) with lambda = {why}{process.note}"
     return Compensator("dead_time_compensator", model, closed, reason)
 
@@ -101,7 +100,5 @@ COMPENSATORS: dict[str, Callable[[DesignTask], Compensator]] = {
 
 
 def _lambda(task: DesignTask, default: float, why: str) -> tuple[float, str]:
-    given = task.options.given_closed_loop_time
-    if given is None:
-        return default, f"{why} = {default:.4g} s"
-    return given, f"{given:.4g} s, as given"
+    closed, given = task.options.closed_loop(default)
+    return closed, f"{closed:.4g} s{given}" if given else f"{why} = {closed:.4g} s"

@@ -90,10 +90,14 @@ class DesignOptions:
     def __post_init__(self) -> None:
         check(self, TuningError)
 
-    @property
-    def given_closed_loop_time(self) -> float | None:
-        """Lambda as it was given [s]; None: the rule decides."""
-        return None if math.isnan(self.closed_loop_time) else self.closed_loop_time
+    def closed_loop(self, default: float) -> tuple[float, str]:
+        """Return lambda, and what a reason says of it; nothing where it was not given.
+
+        :param default: that of the rule [s].
+        """
+        if math.isnan(self.closed_loop_time):
+            return default, ""
+        return self.closed_loop_time, ", as given"
 
     @property
     def added_delay(self) -> float:

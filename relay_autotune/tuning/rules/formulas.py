@@ -29,11 +29,11 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.optimize import brentq
 
 from relay_autotune.errors import ModelError, TuningError
 from relay_autotune.identification.limit_cycle.shape import shape_of_half_cycle
@@ -41,29 +41,31 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
-from relay_autotune.scalar import minimum_near
+from relay_autotune.scalar import minimum_near, root
 from relay_autotune.tuning.task import DesignTask
 
 
 @dataclass(frozen=True)
-class Fopdt:
-    """A stable process ``K exp(-D s)/(tau s + 1)`` for which a rule is made.
+class Reduced:
+    """A process of first or second order with a dead time, for which a rule has formulas.
 
-    :param gain: K [y/u].
-    :param time_constant: tau [s].
-    :param dead_time: D, with what the loop adds to it [s].
+    :param gain: K; of an integrating process the rate per unit step [y/u, y/(u s)].
+    :param lag: tau, the only or the larger time constant [s]; inf: it integrates.
+    :param delay: D, with what the loop adds to it [s].
+    :param second: the smaller time constant [s]; 0: first order.
     :param note: what the reason must say of it; empty where it is the model itself.
     """
 
     gain: float
-    time_constant: float
-    dead_time: float
+    lag: float
+    delay: float
+    second: float = 0.0
     note: str = ""
 
     @property
     def ratio(self) -> float:
         """D/tau."""
-        return self.dead_time / self.time_constant
+        return self.delay / self.lag
 
 
 def process_of(task: DesignTask) -> TransferFunction:
@@ -87,7 +89,7 @@ def is_first_order(model: TransferFunction) -> bool:
     return model.integrators == 0 and not model.zeros and len(lags) == 1 and lags[0].real > 0.0
 
 
-def fopdt_of(rule: str, task: DesignTask) -> Fopdt:
+def fopdt_of(rule: str, task: DesignTask) -> Reduced:
     """Return the FOPDT process on which a rule designs: the model, or else the simple one.
 
     :param rule: name of the rule.
@@ -113,7 +115,7 @@ def fopdt_of(rule: str, task: DesignTask) -> Fopdt:
             f"; designed on the FOPDT {model.gain:.4g} e^(-{model.dead_time:.4g} s)/({tau:.4g} s "
             "+ 1), judged on the model"
         )
-    return Fopdt(model.gain, model.time_constants[0].real, model.dead_time + delay, note)
+    return Reduced(model.gain, model.time_constants[0].real, model.dead_time + delay, note=note)
 
 
 def own_point(rule: str, task: DesignTask) -> UltimatePoint:
@@ -135,21 +137,6 @@ def own_point(rule: str, task: DesignTask) -> UltimatePoint:
             "oscillate): use imc or robust"
         )
     return point
-
-
-def describing_point(rule: str, task: DesignTask) -> UltimatePoint:
-    """Return what the describing function reads from the limit cycle of the relay.
-
-    :param rule: name of the rule.
-    :raises TuningError: if no limit cycle is known, or the process is unstable.
-    """
-    own_point(rule, task)
-    if task.describing is None:
-        raise TuningError(
-            f"the rule {rule} needs the limit cycle of an unbiased relay and none is known: use "
-            f"{rule.removesuffix('_cycle')}, which takes the model's own ultimate point"
-        )
-    return task.describing
 
 
 def wants_pid(rule: str, task: DesignTask, *, pi: bool = True, pid: bool = True) -> bool:
@@ -217,7 +204,7 @@ def _between(model: TransferFunction, low: float, high: float) -> HalfCycle | No
     try:
         if level(low) * level(high) > 0.0:
             return None
-        cycle = HalfCycle(model, float(brentq(level, low, high, rtol=1e-14, xtol=1e-300)))
+        cycle = HalfCycle(model, root(level, low, high))
     except (ModelError, np.linalg.LinAlgError):
         return None
     return cycle if cycle.slope(_AT_SWITCH)[0] > 0.0 else None
@@ -300,19 +287,23 @@ def _by_ultimate_point(name: str, task: DesignTask) -> tuple[Controller, str]:
     :param task: a stable or integrating process with an ultimate point.
     :raises TuningError: for any other, or if the limit cycle is not known.
     """
-    row = _ULTIMATE[name.removesuffix("_cycle")]
-    if name in _ULTIMATE:
-        point, whose = own_point(name, task), "of the model itself"
-    else:
-        point, whose = (
-            describing_point(name, task),
-            "of the limit cycle by the describing function",
-        )
+    row, point, whose = (
+        _ULTIMATE[name.removesuffix("_cycle")],
+        own_point(name, task),
+        "model itself",
+    )
+    if name not in _ULTIMATE:
+        if task.describing is None:
+            raise TuningError(
+                f"the rule {name} needs the limit cycle of an unbiased relay and none is known: "
+                f"use {name.removesuffix('_cycle')}, which takes the model's own ultimate point"
+            )
+        point, whose = task.describing, "limit cycle by the describing function"
     pid = wants_pid(name, task)
     gain, *times = row.pid if pid else row.pi
     gains = controller(task, gain * point.gain, *(share * point.period for share in times))
     said = f"K_u = {point.gain:.4g} and P_u = {point.period:.4g} s"
-    return gains, f"{row.title}: {row.formulas[pid]} with {said} {whose}"
+    return gains, f"{row.title}: {row.formulas[pid]} with {said} of the {whose}"
 
 
 ziegler_nichols, ziegler_nichols_cycle, tyreus_luyben, tyreus_luyben_cycle = (
@@ -336,7 +327,7 @@ def itae(task: DesignTask) -> tuple[Controller, str]:
     :raises TuningError: for any other.
     """
     process = fopdt_of("itae", task)
-    ratio, tau = process.ratio, process.time_constant
+    ratio, k, tau = process.ratio, process.gain, process.lag
     low, high = ITAE_RANGE
     if not low * (1.0 - _ROUNDING) <= ratio <= high * (1.0 + _ROUNDING):
         raise TuningError(
@@ -344,16 +335,10 @@ def itae(task: DesignTask) -> tuple[Controller, str]:
             "below, imc above, or thyagarajan to have it chosen"
         )
     if wants_pid("itae", task):
-        gains = controller(
-            task,
-            0.965 / process.gain * ratio**-0.85,
-            tau / (0.796 - 0.147 * ratio),
-            0.308 * tau * ratio**0.929,
-        )
+        kc, td = 0.965 / k * ratio**-0.85, 0.308 * tau * ratio**0.929
+        gains = controller(task, kc, tau / (0.796 - 0.147 * ratio), td)
     else:
-        gains = controller(
-            task, 0.586 / process.gain * ratio**-0.916, tau / (1.03 - 0.165 * ratio)
-        )
+        gains = controller(task, 0.586 / k * ratio**-0.916, tau / (1.03 - 0.165 * ratio))
     return gains, f"minimum ITAE (Rovira) for D/tau = {ratio:.3g}{process.note}"
 
 
@@ -371,11 +356,8 @@ def imc(task: DesignTask) -> tuple[Controller, str]:
     """
     process = fopdt_of("imc", task)
     share = 0.8 if wants_pid("imc", task) else 1.7
-    default = max(share * process.dead_time, 0.2 * process.time_constant)
-    given = task.options.given_closed_loop_time
-    closed = default if given is None else given
-    why = f"lambda = {closed:.4g} s" + (", as given" if given is not None else "")
-    return _imc("imc", task, process, closed, why)
+    closed, given = task.options.closed_loop(max(share * process.delay, 0.2 * process.lag))
+    return _imc("imc", task, process, closed, f"lambda = {closed:.4g} s{given}")
 
 
 def imc_chang(task: DesignTask) -> tuple[Controller, str]:
@@ -388,22 +370,18 @@ def imc_chang(task: DesignTask) -> tuple[Controller, str]:
     :raises TuningError: for any other.
     """
     process = fopdt_of("imc_chang", task)
-    closed = process.time_constant
-    why = f"lambda = tau = {closed:.4g} s (Chang, Shen and Yu)"
-    return _imc("imc_chang", task, process, closed, why)
+    why = f"lambda = tau = {process.lag:.4g} s (Chang, Shen and Yu)"
+    return _imc("imc_chang", task, process, process.lag, why)
 
 
 def _imc(
-    name: str, task: DesignTask, process: Fopdt, closed: float, why: str
+    name: str, task: DesignTask, process: Reduced, closed: float, why: str
 ) -> tuple[Controller, str]:
-    tau, dead_time = process.time_constant, process.dead_time
-    ti = tau + 0.5 * dead_time
+    tau, half = process.lag, 0.5 * process.delay
+    ti, td = tau + half, 0.0
     if wants_pid(name, task):
-        kc = ti / (process.gain * (closed + 0.5 * dead_time))
-        gains = controller(task, kc, ti, tau * dead_time / (2.0 * tau + dead_time))
-    else:
-        gains = controller(task, ti / (process.gain * closed), ti)
-    return gains, f"IMC with {why}{process.note}"
+        closed, td = closed + half, tau * half / (tau + half)
+    return controller(task, ti / (process.gain * closed), ti, td), f"IMC with {why}{process.note}"
 
 
 RELAXED = 1.15
@@ -433,64 +411,62 @@ def unstable(task: DesignTask) -> tuple[Controller, str]:
         )
     tau = -lags[0].real
     late = model.dead_time + sum(t.real for t in lags[1:])
-    given = task.options.given_closed_loop_time
-    if not late > 0.0 and given is None:
+
+    def gains(closed: float, pid: bool) -> Controller:
+        t, half = closed * (closed / tau + 2.0), 0.5 * late if pid else 0.0
+        kc = tau * (t + half) / (abs(model.gain) * model.process_sign * closed * closed)
+        return controller(task, kc, t + half, t * half / (t + half), b=0.0)
+
+    asked = task.options.ms
+    closed, given = task.options.closed_loop(math.nan)
+    if given:
+        pid = wants_pid("unstable", task)
+        return gains(closed, pid), f"Rotstein-Lewin with lambda = {closed:.4g} s{given}"
+    if not late > 0.0:
         raise TuningError(
             "the rule unstable has no bound on the gain of a process without dead time: give the "
             "closed-loop time constant lambda, or the loop's own delay"
         )
-    if given is not None:
-        pid = wants_pid("unstable", task)
-        return _gains(task, model, tau, late, given, pid), (
-            f"Rotstein-Lewin with lambda = {given:.4g} s, as given"
-        )
     kinds = {"pi": (False,), "pid": (True,), "auto": (False, True)}[task.options.controller]
-    tried = [(*_choose(task, model, tau, late, pid), pid) for pid in kinds]
-    closed, least, pid = next((t for t in tried if t[1] <= task.options.ms), tried[-1])
+
+    def fastest(pid: bool) -> tuple[float, float, bool]:
+        return *_fastest(lambda closed: task.loop(gains(closed, pid)).ms(), late, asked), pid
+
+    tried = [fastest(pid) for pid in kinds]
+    closed, least, pid = next((t for t in tried if t[1] <= asked), tried[-1])
     if least >= _UNSTABLE:
         raise TuningError(
             f"no {'PID' if pid else 'PI'} gains of Rotstein and Lewin hold this process: its dead "
             f"time over its unstable time constant is {late / tau:.3g}, and "
             f"{'2' if pid else '1'} is the limit of any"
         )
-    reason = f"Rotstein-Lewin with lambda = {closed:.4g} s, the fastest "
-    if least <= task.options.ms:
-        reason += f"with Ms <= {task.options.ms:g}"
-    else:
-        reason += (
+    held = f"with Ms <= {asked:g}"
+    if least > asked:
+        held = (
             f"with Ms <= {RELAXED * least:.3g}, {RELAXED:g} times the least that the rule "
-            f"attains: {task.options.ms:g} is out of its reach at D/tau = {late / tau:.3g}"
+            f"attains: {asked:g} is out of its reach at D/tau = {late / tau:.3g}"
         )
-    return _gains(task, model, tau, late, closed, pid), reason
+    return gains(closed, pid), f"Rotstein-Lewin with lambda = {closed:.4g} s, the fastest {held}"
 
 
-def _gains(
-    task: DesignTask, model: TransferFunction, tau: float, late: float, closed: float, pid: bool
-) -> Controller:
-    size = abs(model.gain) * model.process_sign
-    t = closed * (closed / tau + 2.0)
-    half = 0.5 * late if pid else 0.0
-    kc = tau * (t + half) / (size * closed * closed)
-    return controller(task, kc, t + half, t * half / (t + half), b=0.0)
+def _fastest(ms: Callable[[float], float], late: float, asked: float) -> tuple[float, float]:
+    """Return the fastest lambda within the bound on Ms, and the least Ms of any.
 
-
-def _choose(
-    task: DesignTask, model: TransferFunction, tau: float, late: float, pid: bool
-) -> tuple[float, float]:
-    """Return the fastest lambda within the bound on Ms, and the least Ms of any."""
+    :param ms: Ms of a lambda [s].
+    :param late: dead time [s].
+    :param asked: the bound; where no lambda keeps it, a bound above the least takes its place.
+    """
 
     def peak(log_lambda: float) -> float:
-        loop = task.loop(_gains(task, model, tau, late, math.exp(log_lambda), pid))
-        return min(loop.ms(), _UNSTABLE)
+        return min(ms(math.exp(log_lambda)), _UNSTABLE)
 
     grid = np.log(late * _LAMBDAS)
     peaks = [peak(float(x)) for x in grid]
     top = int(np.argmin(peaks))
     at, least = minimum_near(peak, grid, top, 1e-5)
     least, at = min((least, at), (peaks[top], float(grid[top])))
-    bound = task.options.ms if least <= task.options.ms else RELAXED * least
+    bound = asked if least <= asked else RELAXED * least
     before = [float(x) for x, p in zip(grid, peaks, strict=True) if x < at and p > bound]
     if not before or least >= _UNSTABLE:
         return math.exp(at), least
-    x = float(brentq(lambda x: peak(x) - bound, before[-1], at, xtol=1e-9))
-    return math.exp(x), least
+    return math.exp(root(lambda x: peak(x) - bound, before[-1], at, 1e-9)), least

@@ -31,17 +31,17 @@ theta,
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller, SeriesForm
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant
+from relay_autotune.scalar import root
 from relay_autotune.tuning.rules.formulas import (
+    Reduced,
     controller,
     is_first_order,
     named,
@@ -55,22 +55,6 @@ _POINTS = 4000
 _THIRD, _WHOLE = 1.0 - math.exp(-1.0 / 3.0), 1.0 - math.exp(-1.0)
 _SETTLED = 1e-3
 _MONOTONE = 0.02
-
-
-@dataclass(frozen=True)
-class Reduced:
-    """A process of first or second order with a delay, which stands for another.
-
-    :param gain: K; of an integrating process the rate per unit step [y/u, y/(u s)].
-    :param lag: T or tau1 [s]; inf: it integrates.
-    :param delay: L or theta [s].
-    :param second: tau2 [s]; 0: first order.
-    """
-
-    gain: float
-    lag: float
-    delay: float
-    second: float = 0.0
 
 
 def step_response(model: TransferFunction) -> Reduced:
@@ -90,7 +74,11 @@ def step_response(model: TransferFunction) -> Reduced:
         return Reduced(model.gain, math.inf, model.dead_time + shift)
     if is_first_order(model):
         return Reduced(model.gain, model.time_constants[0].real, model.dead_time)
-    return _measured(model)
+    rise = _Rise(model)
+    slopes = np.gradient(rise.y, rise.time)
+    top = int(np.argmax(slopes))
+    delay = float(rise.time[top] - rise.y[top] / slopes[top])
+    return Reduced(model.gain, rise.time_of(_WHOLE) - delay, max(delay, 0.0))
 
 
 def two_point_fopdt(model: TransferFunction) -> TransferFunction:
@@ -136,15 +124,7 @@ class _Rise:
             return float(y[0]) / self._model.gain - share
 
         first = int(np.flatnonzero(self.y >= share)[0])
-        return float(brentq(missing, self.time[first - 1], self.time[first], rtol=1e-12))
-
-
-def _measured(model: TransferFunction) -> Reduced:
-    rise = _Rise(model)
-    slopes = np.gradient(rise.y, rise.time)
-    top = int(np.argmax(slopes))
-    delay = float(rise.time[top] - rise.y[top] / slopes[top])
-    return Reduced(model.gain, rise.time_of(_WHOLE) - delay, max(delay, 0.0))
+        return root(missing, float(self.time[first - 1]), float(self.time[first]))
 
 
 def amigo(task: DesignTask) -> tuple[Controller, str]:
@@ -164,26 +144,19 @@ def amigo(task: DesignTask) -> tuple[Controller, str]:
             "the rule amigo divides by the apparent delay, and the step response has none: its L "
             "must be above 0 s; use imc, or give the loop's own delay"
         )
-    said = f"L = {delay:.4g} s"
     if math.isinf(t):
-        if pid:
-            gains = controller(task, 0.45 / (k * delay), 8.0 * delay, 0.5 * delay, b=0.0)
-        else:
-            gains = controller(task, 0.35 / (k * delay), 13.4 * delay)
-        return gains, f"AMIGO for an integrating process with {said}"
-    if pid:
-        gains = controller(
-            task,
-            (0.2 + 0.45 * t / delay) / k,
-            delay * (0.4 * delay + 0.8 * t) / (delay + 0.1 * t),
-            0.5 * delay * t / (0.3 * delay + t),
-            b=0.0 if delay <= t else 1.0,
-        )
+        what, b = f"for an integrating process with L = {delay:.4g} s", 0.0
+        kc, ti, td = (0.45, 8.0 * delay, 0.5 * delay) if pid else (0.35, 13.4 * delay, 0.0)
+        kc /= k * delay
     else:
-        kc = 0.15 / k + (0.35 - delay * t / (delay + t) ** 2) * t / (k * delay)
-        ti = 0.35 * delay + 13.0 * delay * t * t / (t * t + 12.0 * delay * t + 7.0 * delay**2)
-        gains = controller(task, kc, ti)
-    return gains, f"AMIGO with T = {t:.4g} s and {said}"
+        what, b = f"with T = {t:.4g} s and L = {delay:.4g} s", 0.0 if delay <= t else 1.0
+        if pid:
+            kc, td = (0.2 + 0.45 * t / delay) / k, 0.5 * delay * t / (0.3 * delay + t)
+            ti = delay * (0.4 * delay + 0.8 * t) / (delay + 0.1 * t)
+        else:
+            kc, td = 0.15 / k + (0.35 - delay * t / (delay + t) ** 2) * t / (k * delay), 0.0
+            ti = 0.35 * delay + 13.0 * delay * t * t / (t * t + 12.0 * delay * t + 7.0 * delay**2)
+    return controller(task, kc, ti, td, b if pid else 1.0), f"AMIGO {what}"
 
 
 _MOST_ROUNDS = 50
@@ -201,34 +174,31 @@ def simc(task: DesignTask) -> tuple[Controller, str]:
     """
     model = process_of(task)
     pid = wants_pid("simc", task)
-    given = task.options.given_closed_loop_time
-    process = half_rule(model, 2 if pid else 1, given)
+    tau_c, given = task.options.closed_loop(math.nan)
+    process = half_rule(model, 2 if pid else 1, tau_c)
     if pid and process.second == 0.0:
         raise TuningError(
             "the rule simc gives a first-order process no derivative action: ask for pi, or use "
             "another rule"
         )
-    if given is None and not process.delay > 0.0:
+    closed = tau_c if given else process.delay
+    if not (given or closed > 0.0):
         raise TuningError(
             "the rule simc takes its closed-loop time constant from the effective delay, and the "
             "model has none: give tau_c, or the loop's own delay"
         )
-    closed = process.delay if given is None else given
     total = closed + process.delay
-    if math.isinf(process.lag):
-        kc, ti = 1.0 / (process.gain * total), 4.0 * total
-    else:
-        kc = process.lag / (process.gain * total)
-        ti = min(process.lag, 4.0 * total)
+    kc, ti = 1.0 / (process.gain * total), 4.0 * total
+    if not math.isinf(process.lag):
+        kc, ti = process.lag / (process.gain * total), min(process.lag, ti)
     ideal = SeriesForm(kc, ti, process.second, 0.0).isa()
-    chosen = "" if given is None else ", as given,"
-    reason = (
-        f"SIMC with tau_c = {closed:.4g} s{chosen} and an effective delay of {process.delay:.4g} s"
+    return controller(task, ideal.kc, ideal.ti, ideal.td), (
+        f"SIMC with tau_c = {closed:.4g} s{given + ',' * bool(given)} and an effective delay of "
+        f"{process.delay:.4g} s"
     )
-    return controller(task, ideal.kc, ideal.ti, ideal.td), reason
 
 
-def half_rule(model: TransferFunction, order: int, closed: float | None = None) -> Reduced:
+def half_rule(model: TransferFunction, order: int, closed: float = math.nan) -> Reduced:
     """Reduce a process to first or second order (Skogestad 2003, eqs 10 and 11).
 
     The largest neglected lag goes half to the delay and half to the smallest lag that is kept;
@@ -237,7 +207,7 @@ def half_rule(model: TransferFunction, order: int, closed: float | None = None) 
 
     :param model: a process of real lags and zeros, with one integrator at most.
     :param order: 1 or 2.
-    :param closed: tau_c, of which the rules for positive zeros make use [s]; None: the delay.
+    :param closed: tau_c, of which the rules for positive zeros make use [s]; NaN: the delay.
     :raises TuningError: for any other.
     """
     constants = (*model.time_constants, *model.zeros)
@@ -249,8 +219,9 @@ def half_rule(model: TransferFunction, order: int, closed: float | None = None) 
         )
     if not model.time_constants and not model.integrators:
         raise TuningError("the half rule needs a lag or an integrator, found neither: use robust")
-    found = _reduced(model, model.dead_time if closed is None else closed, order)
-    if closed is None and any(z.real > 0.0 for z in model.zeros):
+    unknown = math.isnan(closed)
+    found = _reduced(model, model.dead_time if unknown else closed, order)
+    if unknown and any(z.real > 0.0 for z in model.zeros):
         # The delay that the rules for zeros ask for is the one that comes of them.
         for _ in range(_MOST_ROUNDS):
             before, found = found, _reduced(model, found.delay, order)
@@ -273,7 +244,7 @@ def _reduced(model: TransferFunction, closed: float, order: int) -> Reduced:
         kept[-1] += 0.5 * rest[0]
     if not kept:
         raise TuningError("the half rule leaves no lag beside the zeros: use robust")
-    return Reduced(gain, kept[0], delay, *kept[1:])
+    return Reduced(gain, kept[0], delay, sum(kept[1:]))
 
 
 def _cancel(lags: list[float], lead: float, closed: float) -> float:
