@@ -68,13 +68,10 @@ class GainsJournal:
 
     def __init__(self, folder: Path, node: str, domain: int, loop: str, command: str) -> None:
         within = f".domain{domain}" if domain else ""
-        # A node name never contains a dot, so the replacement is unique.
-        name = f"gains{node.replace('/', '.')}{within}"
         # Topics as a whole could be too long for the name of a file.
         which = hashlib.sha256(f"{loop} {command}".encode()).hexdigest()[:8]
-        self.path = folder / f"{name}.{which}.json"
-        # Its name before a loop was in it.
-        self._before = folder / f"{name}.json"
+        # A node name never contains a dot, so the replacement is unique.
+        self.path = folder / f"gains{node.replace('/', '.')}{within}.{which}.json"
         self._loop = loop
         self._lock = threading.Lock()
         self._newest = 0
@@ -108,19 +105,7 @@ class GainsJournal:
 
         :raises JournalError: if the file is not a journal of this loop.
         """
-        if (found := self._read(self.path)) is None:
-            loop, history = self._read(self._before) or ("", None)
-            return history if loop == self._loop else None
-        loop, history = found
-        if loop != self._loop:
-            raise JournalError(
-                f"{self.path} is of the loop {_short(loop)!r}, found {self._loop!r}: remove the "
-                "file, which is not where it was made"
-            )
-        return history
-
-    def _read(self, path: Path) -> tuple[str, GainsHistory] | None:
-        """Return the loop of a file and its state; None: there is no file."""
+        path = self.path
         try:
             # Without waiting for the other end of a pipe.
             descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -143,7 +128,12 @@ class GainsJournal:
             raise _unreadable(path, f"{type(error).__name__}: {_short(error)}") from error
         if version != _VERSION:
             raise _unreadable(path, f"it is of version {_short(version)}, expected {_VERSION}")
-        return loop, history
+        if loop != self._loop:
+            raise JournalError(
+                f"{path} is of the loop {_short(loop)!r}, found {self._loop!r}: remove the file, "
+                "which is not where it was made"
+            )
+        return history
 
     def saving(self, history: GainsHistory) -> Callable[[], None]:
         """Return what writes a state and waits until it is on the disk; any thread may call it.

@@ -102,22 +102,6 @@ def test_each_node_and_each_loop_has_its_own(tmp_path):
     assert len(paths) == 36
 
 
-def test_a_loop_finds_its_file_of_before_loops_were_in_the_name(tmp_path):
-    before = journal_in(tmp_path)
-    before.saving(HISTORY)()
-    before.close()
-    before.path.rename(tmp_path / "gains.tank.c.json")
-    # Another loop leaves it alone, however often.
-    for _ in range(2):
-        other = journal_in(tmp_path, loop="/z")
-        assert other.load() is None
-        other.close()
-    journal = journal_in(tmp_path)
-    assert journal.load() == HISTORY
-    journal.saving(replace(HISTORY, given=None))()
-    assert journal.load() == replace(HISTORY, given=None)
-
-
 def test_a_second_process_is_refused_and_a_killed_one_leaves_a_whole_file(tmp_path):
     rng = Random(1)
     for _ in range(5):
