@@ -404,7 +404,7 @@ class JointLoop(Loop):
 
     def _position_of(self, joint: str) -> float:
         kind = message_class(_JOINT_STATE, "measurement_type")
-        for message in self._robot.heard(kind, self._manager.node_of(_JOINT_STATES), 0.0, 1):
+        for message in self._robot.heard(kind, self._manager.node_of(_JOINT_STATES), bool):
             if joint in message.name:
                 return float(message.position[list(message.name).index(joint)])
         return math.nan

@@ -34,6 +34,7 @@ from relay_autotune.text import in_units
 
 if TYPE_CHECKING:
     from relay_autotune.loop.gains import Controller
+    from relay_autotune.nodes.live_types import Reader
     from relay_autotune.nodes.tune_client import TuneClient
 
 # Purpose and text of each command that may follow.
@@ -42,6 +43,8 @@ Steps = list[tuple[str, str]]
 WhyOver = Callable[[int], str]
 # How long to wait for what a node still has to answer, and at most while a page waits [s].
 PATIENCE, _ANSWERS = 5.0, 1.0
+# How long present commands are listened to [s].
+_LISTEN = 1.0
 
 
 class Loop:
@@ -221,13 +224,12 @@ class TopicLoop(Loop):
             self._kind = client.kind_of(measurement, options.wait, published=True)
             self._command_kind = client.kind_of(command, options.wait, published=False)
             client.require_uncontrolled()
-        self._choose_field()
+        reader = self._reader()
         self._command_field = options.command_field or "data"
+        with Working(f"listening to {measurement}"):
+            heard = client.heard(reader.kind, measurement, bool, options.wait, number=reader.value)
+        answers.measured = heard[-1] if heard else math.nan
         try:
-            with Working(f"listening to {measurement}"):
-                answers.measured = client.measured(
-                    measurement, self._kind, options.field, options.wait
-                )
             self._commands = CommandMessage(
                 self._command_kind, self._command_field, options.command_message or ""
             )
@@ -247,8 +249,8 @@ class TopicLoop(Loop):
             known = options.amplitude and options.command_within is None
             answers.ask(*map(Question, self.form[: 2 if known else 3]))
 
-    def _choose_field(self) -> None:
-        """Ask for the number that measures where the messages do not have the one of --field.
+    def _reader(self) -> Reader:
+        """Return what reads the measurement; ask where the messages do not have that of --field.
 
         :raises SelectionError: if nobody can be asked.
         """
@@ -258,8 +260,7 @@ class TopicLoop(Loop):
         options = self.options
         while True:
             try:
-                reader_of(self._kind, options.field)
-                return
+                return reader_of(self._kind, options.field)
             except ParameterError as error:
                 told = as_flags(str(error))
             kind = message_class(self._kind, "measurement_type")
@@ -290,9 +291,12 @@ class TopicLoop(Loop):
         topic = self.options.command
         if not (others := self.client.others_on(topic)):
             return
-        present = self.client.commanded(topic, self._commands)
-        says, at = "", ""
-        if not math.isnan(present):
+        commands, says, at = self._commands, "", ""
+        heard = self.client.heard(
+            commands.kind, topic, lambda _: False, _LISTEN, number=commands.value
+        )
+        if heard:
+            present = sum(heard) / len(heard)
             says = f", {present:.6g} u now"
             at = f" with --at {present:.6g}, while the process still rests there"
         told = (

@@ -88,8 +88,8 @@ def _serve(nodes: OwnNodes) -> None:
 
     with LoopClient(PROGRAM, "", "relay_node") as client:
 
-        def now(patience: float) -> float:
-            came: list[Float64] = client.heard(Float64, "/measurement", patience, least=1)
+        def now(seconds: float) -> float:
+            came: list[Float64] = client.heard(Float64, "/measurement", bool, least=seconds)
             _require_alive(nodes)
             if not came:
                 raise LoopError("plant_node publishes no measurement")

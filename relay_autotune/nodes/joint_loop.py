@@ -352,7 +352,8 @@ def _of_dof(client: LoopClient, node: str, dof: str) -> dict[str, Any]:
 def _states(client: LoopClient, node: str, parts: _Parts) -> tuple[DofState, ...]:
     """Return the state of all joints: the mean of some messages, and the newest reference."""
     topic = f"{node}/controller_state"
-    came = client.heard(interface_class("control_msgs", "msg", parts.kind), topic, _LOOK, _LEAST)
+    kind = interface_class("control_msgs", "msg", parts.kind)
+    came = client.heard(kind, topic, lambda came: len(came) >= _LEAST, least=_LOOK)
     if len(came) < _LEAST:
         raise LoopError(
             f"{topic} has told {len(came)} states within some seconds, expected one for each "

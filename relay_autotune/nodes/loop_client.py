@@ -28,7 +28,6 @@ from rclpy.validate_topic_name import validate_topic_name
 from relay_autotune.errors import FieldError, LoopError, ParameterError
 from relay_autotune.exchange.messages import made_visible
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.live_types import CommandMessage, reader_of
 
 # How long present commands are listened to [s].
 _LISTEN = 1.0
@@ -154,20 +153,49 @@ class LoopClient:
         )
         return came
 
+    def heard(
+        self,
+        kind: Any,
+        topic: str,
+        enough: Callable[[list[Any]], bool],
+        patience: float = ANSWER_WITHIN,
+        # Best effort, so that nobody waits for this client.
+        profile: QoSProfile = qos_profile_sensor_data,
+        *,
+        least: float = 0.0,
+        number: Callable[[Any], float] | None = None,
+    ) -> list[Any]:
+        """Return what comes on a topic until it is enough, or a time is over.
+
+        :param kind: the message class.
+        :param topic: its name.
+        :param enough: tells whether what has come is enough.
+        :param patience: how long to wait for it [s].
+        :param profile: quality of service.
+        :param least: how long to hear it in any case [s].
+        :param number: reads the number in a message; messages without it are passed over. None:
+            the messages themselves are returned.
+        """
+        came: list[Any] = []
+        take = readable(number, came.append) if number else came.append
+        until = time.monotonic() + least
+        with self._hearing(kind, topic, take, profile):
+            self.wait(lambda: enough(came) and time.monotonic() >= until, patience)
+        return came
+
     def latched(
         self, kind: Any, topic: str, wanted: Callable[[Any], bool], patience: float
     ) -> Any | None:
         """Return the newest wanted message of a latched topic; None: none came.
 
         :param kind: the message class.
-        :param topic: its unresolved name.
+        :param topic: its name.
         :param wanted: tells whether a message is one of them.
         :param patience: how long to wait for it [s].
         """
-        came: list[Any] = []
-        with self._hearing(kind, self._resolved(topic), came.append, quality.latched(10)):
-            self.wait(lambda: any(map(wanted, came)), patience)
-        return next((message for message in reversed(came) if wanted(message)), None)
+        profile = quality.latched(10)
+        came = self.heard(kind, topic, lambda came: any(map(wanted, came)), patience, profile)
+        return next(filter(wanted, reversed(came)), None)
 
     def call(
         self, kind: Any, service: str, request: Any, patience: float = 0.0, *, again: bool = False
@@ -264,32 +292,17 @@ class LoopClient:
         """
         self.wait(lambda: False, seconds)
 
-    def heard(self, kind: Any, topic: str, seconds: float, least: int = 0) -> list[Any]:
-        """Return the messages of a topic that come within a time.
-
-        :param kind: the message class.
-        :param topic: its full name.
-        :param seconds: the time [s].
-        :param least: how many are waited for before it, for `ANSWER_WITHIN` at most.
-        """
-        came: list[Any] = []
-        with self._hearing(kind, topic, came.append):
-            self.wait(lambda: len(came) >= least, ANSWER_WITHIN)
-            self.rest(seconds)
-        return came
-
     @contextmanager
     def _hearing(
         self,
         kind: Any,
         topic: str,
         take: Callable[[Any], object],
-        # Best effort, so that nobody waits for this client.
         profile: QoSProfile = qos_profile_sensor_data,
     ) -> Iterator[None]:
         """Hear a topic until the end of the block."""
         ear = self._node.create_subscription(
-            kind, topic, lambda message: take(made_visible(message)), profile
+            kind, self._resolved(topic), lambda message: take(made_visible(message)), profile
         )
         try:
             yield
@@ -432,34 +445,6 @@ class LoopClient:
         """
         mouth = self._node.create_publisher(kind, self._resolved(topic), quality.COMMAND)
         return lambda: self._node.destroy_publisher(mouth)
-
-    def commanded(self, topic: str, commands: CommandMessage) -> float:
-        """Return the mean of the commands that are published now; NaN: none are.
-
-        :param topic: name of the command's topic.
-        :param commands: reads its messages.
-        """
-        heard: list[float] = []
-        hear = readable(commands.value, heard.append)
-        with self._hearing(commands.kind, self._resolved(topic), hear):
-            self.rest(_LISTEN)
-        return sum(heard) / len(heard) if heard else math.nan
-
-    def measured(self, topic: str, type_name: str, field: str, patience: float) -> float:
-        """Return the present measurement; NaN: none comes.
-
-        :param topic: name of its topic.
-        :param type_name: its message type.
-        :param field: path of the number in its messages.
-        :param patience: how long to wait for it [s].
-        :raises ParameterError: if the messages of this type do not have such a number.
-        """
-        reader = reader_of(type_name, field)
-        heard: list[float] = []
-        hear = readable(reader.value, heard.append)
-        with self._hearing(reader.kind, self._resolved(topic), hear):
-            self.wait(lambda: bool(heard), patience)
-        return heard[-1] if heard else math.nan
 
     def _topic_of(self, relay: str, topic: str, type_name: str, *, published: bool) -> str:
         """Return the name that a topic of a relay_node has, which may be remapped.

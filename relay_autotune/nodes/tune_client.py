@@ -270,13 +270,13 @@ class TuneClient(LoopClient):
         kind, field = self.values(self.name, ["command_type", "command_field"]).values()
         commands = CommandMessage(kind, field, "", taken=True, now_ns=time.time_ns)
         name = self._topic_of(self.name, "command", commands.type_name, published=True)
-        cycles, hear = self._resolved("relay_cycle"), readable(commands.value, take)
+        hear = readable(commands.value, take)
 
         @contextmanager
         def heard() -> Iterator[None]:
             with (
                 self._hearing(commands.kind, name, hear),
-                self._hearing(RelayCycle, cycles, cycle),
+                self._hearing(RelayCycle, "relay_cycle", cycle),
             ):
                 yield
 

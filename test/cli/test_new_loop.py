@@ -188,8 +188,9 @@ class Looker:
     def kind_of(self, topic: str, patience: float, *, published: bool) -> str:
         return self.kind if topic == "/tank/level" else self.takes
 
-    def commanded(self, topic: str, commands: Any) -> float:
-        return self.present
+    def heard(self, kind: Any, topic: str, *_: Any, **__: Any) -> list[float]:
+        found = self.measures if topic == "/tank/level" else self.present
+        return [] if math.isnan(found) else [found]
 
     def others_on(self, topic: str) -> str:
         return self.others
@@ -197,9 +198,6 @@ class Looker:
     def claim(self, kind: Any, topic: str) -> Callable[[], object]:
         self.claims = True
         return lambda: setattr(self, "claims", False)
-
-    def measured(self, topic: str, type_name: str, field: str, patience: float) -> float:
-        return self.measures
 
     def require_uncontrolled(self) -> None:
         pass

@@ -419,7 +419,7 @@ class Arm:
         names = [name for name in self._values if name.startswith(request.prefixes[0])]
         return SimpleNamespace(result=SimpleNamespace(names=names))
 
-    def heard(self, kind, topic, seconds, least):
+    def heard(self, kind, topic, enough, **_):
         def points(**values):
             return SimpleNamespace(**values)
 
@@ -429,7 +429,7 @@ class Arm:
             feedback=points(positions=[0.25, 0.15]),
             output=points(effort=[3.0, 1.0], velocities=[]),
         )
-        return [message] * least
+        return [message] * 5
 
     def latched(self, kind, topic, wanted, patience):
         assert topic == "/robot_description" and patience > 0.0
