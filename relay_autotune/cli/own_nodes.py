@@ -20,7 +20,6 @@ import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import MappingProxyType
 from typing import IO, Any
 
 from relay_autotune.cli.terminal import Working
@@ -110,24 +109,18 @@ class OwnNodes:
 
     They are not in the terminal's group, so that Ctrl-C reaches the command alone, which ends the
     tune in order. If the command itself is killed, each of them gets SIGTERM from the system, and
-    `relay_node` sends the safe command.
-
-    :param nodes: the arguments for ROS of each node, by the name of its executable, in the order
-        in which they end; more of them can be started later.
+    `relay_node` sends the safe command. They end in the order in which they were started.
     """
 
-    def __init__(self, nodes: Mapping[str, Sequence[str]] = MappingProxyType({})) -> None:
-        self._nodes = nodes
+    def __init__(self) -> None:
         self._running: dict[str, subprocess.Popen[bytes]] = {}
         self._logs: dict[str, IO[bytes]] = {}
 
     def __enter__(self) -> OwnNodes:
-        for name, arguments in self._nodes.items():
-            self.start(name, arguments)
         return self
 
     def start(self, name: str, arguments: Sequence[str]) -> int:
-        """Start one node more, and return the id of its process.
+        """Start a node, and return the id of its process.
 
         :param name: of its executable.
         :param arguments: its arguments for ROS.
@@ -155,13 +148,6 @@ class OwnNodes:
         file = self._logs[name].fileno()
         # A plain read would move the place at which the node writes.
         return os.pread(file, os.fstat(file).st_size, 0).decode(errors="replace")
-
-    def arguments(self, name: str) -> Sequence[str]:
-        """Return the arguments for ROS with which a node was started.
-
-        :param name: of its executable.
-        """
-        return self._nodes[name]
 
     def end(self, name: str) -> None:
         """End one node before the others, if it was started.

@@ -55,7 +55,9 @@ def _run(options: argparse.Namespace) -> int:
         # ROS itself would only warn, and start the nodes with their defaults.
         raise SelectionError(f"--params {file}: there is no such file")
     try:
-        with OwnNodes({name: ["--params-file", str(file)] for name in NODES}) as nodes:
+        with OwnNodes() as nodes:
+            for name in NODES:
+                nodes.start(name, ["--params-file", str(file)])
             _serve(nodes)
     except KeyboardInterrupt:
         print("\nended")
