@@ -23,7 +23,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, USAGE, finite, guarded_in_graph, say
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, finite, guarded_in_graph, say
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import (
     Help,
@@ -35,7 +35,7 @@ from relay_autotune.cli.terminal import (
     width,
     write,
 )
-from relay_autotune.errors import LoopError, ParameterError, TuningError
+from relay_autotune.errors import LoopError, TuningError
 from relay_autotune.exchange.messages import reason_from_message
 from relay_autotune.reasons import Code
 from relay_autotune.text import digits, duration
@@ -107,11 +107,7 @@ def _parser() -> argparse.ArgumentParser:
 def _work(options: argparse.Namespace, graph: ExitStack) -> int:
     from relay_autotune.nodes.gains_client import GainsClient
 
-    try:
-        client = graph.enter_context(GainsClient(options.namespace, options.node))
-    except ParameterError as error:
-        say(PROGRAM, str(error))
-        return USAGE
+    client = graph.enter_context(GainsClient(options.namespace, options.node))
     if options.file:
         return _write(client, options)
     client.find(_FOUND_WITHIN)

@@ -20,7 +20,13 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from relay_autotune.cli.terminal import broken, end_with_terminal, width
-from relay_autotune.errors import MissingPackageError, RelayAutotuneError, SelectionError, defect
+from relay_autotune.errors import (
+    MissingPackageError,
+    ParameterError,
+    RelayAutotuneError,
+    SelectionError,
+    defect,
+)
 from relay_autotune.quantities import Quantity
 from relay_autotune.text import visible
 
@@ -103,7 +109,7 @@ def run_command(program: str, work: Callable[[], int]) -> int:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         status = work()
         sys.stdout.flush()
-    except SelectionError as error:
+    except (SelectionError, ParameterError) as error:
         say(program, str(error))
         return USAGE
     except RelayAutotuneError as error:

@@ -18,7 +18,7 @@ import numpy as np
 from relay_autotune.cli.arguments import DONE, finite, run_command, with_negative
 from relay_autotune.cli.table import identification_lines
 from relay_autotune.cli.terminal import labelled, width
-from relay_autotune.errors import ParameterError, SelectionError, look_up
+from relay_autotune.errors import SelectionError, look_up
 from relay_autotune.exchange.fields import to_document
 from relay_autotune.exchange.models import to_json
 from relay_autotune.identification.estimate import Estimate
@@ -357,10 +357,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(options: argparse.Namespace) -> int:
     numbers = {name: value for name in NUMBERS if (value := getattr(options, name)) is not None}
-    try:
-        known = Known(structure=options.structure, order=options.order)
-    except ParameterError as error:
-        raise SelectionError(str(error)) from error
+    known = Known(structure=options.structure, order=options.order)
     found = identify_chart(options.method, numbers, known)
     if options.json:
         print(to_json(to_document(found)), flush=True)

@@ -42,7 +42,6 @@ from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN, own_namespace
 from relay_autotune.cli.settings import FLAGS, Kind, add_settings, kind_of
 from relay_autotune.cli.terminal import GoBack, Help, Working, agrees, require_new, width
 from relay_autotune.cli.tune_view import Shown, check_lines
-from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
 from relay_autotune.nodes.shell import prefix, typed_for_parameter
 
@@ -264,11 +263,8 @@ class Session:
             check_web(options)
 
     def _joined(self, kind: Callable[..., _Client], *arguments: Any) -> _Client:
-        try:
-            with Working("joining the ROS graph"):
-                found = kind(*arguments)
-        except ParameterError as error:
-            raise SelectionError(str(error)) from None
+        with Working("joining the ROS graph"):
+            found = kind(*arguments)
         self.graph.enter_context(found)
         return found
 
