@@ -74,15 +74,10 @@ class ChecklistLine:
 
 
 class Checklist:
-    """Collect checks.
+    """Collect checks."""
 
-    :param stops: True: the first check that fails raises its error; False: all checks are made.
-    """
-
-    def __init__(self, *, stops: bool) -> None:
+    def __init__(self) -> None:
         self.checks: list[ChecklistLine] = []
-        self.stops = stops
-        """True if the first check that fails raises its error."""
 
     @property
     def refusals(self) -> list[Reason]:
@@ -105,8 +100,6 @@ class Checklist:
         try:
             value = work()
         except RelayAutotuneError as error:
-            if self.stops:
-                raise
             why = reason_of(error)
             self.checks.append(ChecklistLine(Mark.NO, name, str(why), why))
             return None
@@ -212,7 +205,6 @@ class Readiness:
         :param checks: get a line each.
         :param held: the command that the node holds now [u]; None: it has not sent a command.
         :param last: amplitude of the last tune [u], and its last cycle; None: there is none.
-        :raises RelayAutotuneError: the reason not to start, if the checks stop there.
         """
         values = values_of(self._node, TUNE_PARAMETERS)
         chosen = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}
@@ -233,8 +225,6 @@ class Readiness:
             partial(_require_within_limits, parameters, self._sensor.samples.newest),
             lambda _: "the measurement is within its limits",
         )
-        if checks.stops:
-            return ready
         checks.tell("limits", _limits_of(parameters))
         checks.tell("at rest", _rest_of(self._sensor.samples))
         checks.tell("recording", _recording_in(values["record_directory"]))
@@ -451,7 +441,7 @@ def _recording_in(directory: str) -> str | Reason:
     :param directory: folder of the recordings.
     """
     folder = Path(directory).expanduser()
-    there = next(path for path in (folder, *folder.parents) if path.exists())
+    there = next(path for path in (folder, *folder.parents) if os.access(path, os.F_OK))
     if not (there.is_dir() and os.access(there, os.W_OK)):
         return Code.NO_FOLDER(folder=str(there))
     free = shutil.disk_usage(there).free

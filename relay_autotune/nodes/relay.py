@@ -17,7 +17,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from std_srvs.srv import Trigger
 
-from relay_autotune.errors import FieldError, NotReadyError, RelayAutotuneError
+from relay_autotune.errors import FieldError, NotReadyError
 from relay_autotune.exchange.messages import finding_from_message, set_stamp
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
@@ -33,7 +33,7 @@ from relay_autotune.nodes.results import MODEL, OwnResults, said_by
 from relay_autotune.nodes.session import Session, SetpointSession, reported_by
 from relay_autotune.nodes.tables import FIXED_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.nodes.watch import Arrival, Sensor
-from relay_autotune.reasons import Code, Reason, reason_of
+from relay_autotune.reasons import Code, Reason
 from relay_autotune.record.record import Cycle, Outcome
 from relay_autotune.text import duration
 from relay_autotune_msgs.srv import StartTune
@@ -183,16 +183,12 @@ class RelayNode(ServedNode):
         return self._request(request.amplitude, request.dry_run)
 
     def _request(self, amplitude: float, dry_run: bool) -> StartTune.Response:
-        checks = Checklist(stops=not dry_run)
-        try:
-            if self._session is not None:
-                raise NotReadyError(Code.RUNNING(tune=self._session.id, node=self._name))
-            ready = self._readiness.of(amplitude, checks, self._held, self._last_cycle)
-        except RelayAutotuneError as error:
-            self.get_logger().warning(f"start refused: {error}")
-            return refused(reason_of(error))
+        if self._session is not None:
+            return self._refuse(Code.RUNNING(tune=self._session.id, node=self._name))
+        checks = Checklist()
+        ready = self._readiness.of(amplitude, checks, self._held, self._last_cycle)
         if ready is None:
-            return answer_of(checks)
+            return answer_of(checks) if dry_run else self._refuse(checks.refusals[0])
         takes = self._readiness.time_of(ready, ready.parameters)
         if dry_run:
             reason = f"a tune could start: {ready.plan}; {takes}"
@@ -202,6 +198,10 @@ class RelayNode(ServedNode):
         self.get_logger().info(f"tune {identity} started: {reason}")
         reason += f"; watch {WATCH.format(self._name)}"
         return StartTune.Response(accepted=True, reason=reason, experiment_id=identity)
+
+    def _refuse(self, why: Reason) -> StartTune.Response:
+        self.get_logger().warning(f"start refused: {why}")
+        return refused(why)
 
     def _start(self, ready: Ready) -> tuple[str, str]:
         parameters, policy = ready.parameters, ready.policy

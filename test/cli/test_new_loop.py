@@ -412,7 +412,7 @@ def test_neither_yes_nor_a_law_becomes_the_name_of_a_file(
 
 def test_what_failed_names_the_flag_and_no_node_that_ends_with_the_command() -> None:
     """What to set comes from the reason, whatever the line says."""
-    node = Checklist(stops=False)
+    node = Checklist()
     node.tell("limits", Code.NO_LIMITS(missing="measurement_min", limit="measurement_min"))
     node.tell("model", Code.NO_IDENTIFIER(where="", run=""))
     node.tell("time", "; type: ros2 param set /t/relay_node amplitude A")
