@@ -11,11 +11,18 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
-from relay_autotune.cli.arguments import DONE, finite, run_command, with_negative
+from relay_autotune.cli.arguments import (
+    DONE,
+    add_quantities,
+    flag_of,
+    given_quantities,
+    run_command,
+    with_negative,
+)
 from relay_autotune.cli.table import identification_lines
 from relay_autotune.cli.terminal import labelled, width
 from relay_autotune.errors import SelectionError, look_up
@@ -36,6 +43,7 @@ from relay_autotune.identification.methods.wang import (
 )
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.process.structures import FOPDT
+from relay_autotune.quantities import Quantity
 
 PROGRAM = "identify"
 
@@ -48,55 +56,55 @@ Examples:
            --peak-max 0.5 --peak-min -0.29 --relay 1 --bias 0.3 --gain 1
 """
 
-ANY, POSITIVE, NOT_NEGATIVE, NOT_ZERO = "", "> 0", ">= 0", "not 0"
-
-
-@dataclass(frozen=True)
-class ChartNumber:
-    """A number that the command line may give.
-
-    :param unit: its unit.
-    :param meaning: what it is, for the help.
-    :param range: one of ``ANY``, ``POSITIVE``, ``NOT_NEGATIVE``, ``NOT_ZERO``.
-    """
-
-    unit: str
-    meaning: str
-    range: str = ANY
-
-
-NUMBERS: dict[str, ChartNumber] = {
-    "period": ChartNumber("s", "period of the limit cycle", POSITIVE),
-    "period_high": ChartNumber("s", "time that the command stays high", POSITIVE),
-    "period_low": ChartNumber("s", "time that the command stays low", POSITIVE),
-    "amplitude": ChartNumber("y", "half of peak to peak of the measurement", POSITIVE),
-    "peak_max": ChartNumber("y", "highest measurement, from its steady state"),
-    "peak_min": ChartNumber("y", "lowest measurement, from its steady state"),
-    "relay": ChartNumber("u", "amplitude of the relay, half the distance of its levels", POSITIVE),
-    "bias": ChartNumber("u", "middle of the relay's levels, from the steady state"),
-    "hysteresis": ChartNumber(
-        "y", "half width of the switching band, 0 if not given", NOT_NEGATIVE
+_number = partial(Quantity, default=math.nan)
+_positive = partial(_number, lower=0.0, open_ended=True)
+_not_negative = partial(_number, lower=0.0)
+NUMBERS = (
+    _positive("period", unit="s", description="Period of the limit cycle."),
+    _positive("period_high", unit="s", description="Time that the command stays high."),
+    _positive("period_low", unit="s", description="Time that the command stays low."),
+    _positive("amplitude", unit="y", description="Half of peak to peak of the measurement."),
+    _number("peak_max", unit="y", description="Highest measurement, from its steady state."),
+    _number("peak_min", unit="y", description="Lowest measurement, from its steady state."),
+    _positive(
+        "relay", unit="u", description="Amplitude of the relay, half the distance of its levels."
     ),
-    "gain": ChartNumber("y/u", "static gain of the process", NOT_ZERO),
-    "dead_time": ChartNumber("s", "dead time of the process", NOT_NEGATIVE),
-    "extra_delay": ChartNumber("s", "dead time added to the relay, in the second test", POSITIVE),
-    "period_2": ChartNumber("s", "period in the second test", POSITIVE),
-    "amplitude_2": ChartNumber("y", "half of peak to peak in the second test", POSITIVE),
-    "relay_2": ChartNumber("u", "amplitude of the relay in the second test, if another", POSITIVE),
-    "mean_measurement": ChartNumber("y", "mean over whole cycles, from the steady state"),
-    "mean_command": ChartNumber("u", "mean over whole cycles, from the steady state"),
-    "time_to_peak": ChartNumber("s", "from a switch to the peak after it", POSITIVE),
-    "rise": ChartNumber(
-        "s", "from the steady state to the peak, if not the time from the switch", POSITIVE
+    _number("bias", unit="u", description="Middle of the relay's levels, from the steady state."),
+    _not_negative(
+        "hysteresis", unit="y", description="Half width of the switching band, 0 if not given."
     ),
-    "time_half": ChartNumber("s", "from the steady state to half of the peak", POSITIVE),
-    "step": ChartNumber("u", "height of a step of the command", NOT_ZERO),
-    "t1": ChartNumber("s", "from the end of the dead time to the extremum", POSITIVE),
-    "t2": ChartNumber("s", "from the end of the dead time to the return", POSITIVE),
-    "extremum": ChartNumber(
-        "y", "minimum or maximum after a step, from the steady state", NOT_ZERO
+    _number("gain", unit="y/u", description="Static gain of the process."),
+    _not_negative("dead_time", unit="s", description="Dead time of the process."),
+    _positive(
+        "extra_delay", unit="s", description="Dead time added to the relay, in the second test."
     ),
-}
+    _positive("period_2", unit="s", description="Period in the second test."),
+    _positive("amplitude_2", unit="y", description="Half of peak to peak in the second test."),
+    _positive(
+        "relay_2", unit="u", description="Amplitude of the relay in the second test, if another."
+    ),
+    _number(
+        "mean_measurement", unit="y", description="Mean over whole cycles, from the steady state."
+    ),
+    _number(
+        "mean_command", unit="u", description="Mean over whole cycles, from the steady state."
+    ),
+    _positive("time_to_peak", unit="s", description="From a switch to the peak after it."),
+    _positive(
+        "rise",
+        unit="s",
+        description="From the steady state to the peak, if not the time from the switch.",
+    ),
+    _positive("time_half", unit="s", description="From the steady state to half of the peak."),
+    _number("step", unit="u", description="Height of a step of the command."),
+    _positive("t1", unit="s", description="From the end of the dead time to the extremum."),
+    _positive("t2", unit="s", description="From the end of the dead time to the return."),
+    _number(
+        "extremum", unit="y", description="Minimum or maximum after a step, from the steady state."
+    ),
+)
+"""What the command line may give."""
+_NOT_ZERO = ("gain", "step", "extremum")
 
 
 # Each method is a function of the numbers that it takes, by their names in NUMBERS; those without
@@ -282,9 +290,7 @@ CHART_METHODS: dict[str, Chart] = {
 }
 
 
-def option(name: str) -> str:
-    """Return the command-line option of a number."""
-    return "--" + name.replace("_", "-")
+_FLAGS = {each.name: flag_of(each) for each in NUMBERS}
 
 
 def identify_chart(method: str, numbers: Mapping[str, float], known: Known) -> Identification:
@@ -298,23 +304,16 @@ def identify_chart(method: str, numbers: Mapping[str, float], known: Known) -> I
     :raises IdentificationError: if no model has these numbers.
     """
     chart = look_up(CHART_METHODS, method, "method", SelectionError)
-    if lacking := [option(n) for n in chart.required if n not in numbers]:
+    if lacking := [_FLAGS[n] for n in chart.required if n not in numbers]:
         raise SelectionError(f"{method} also needs {', '.join(lacking)}")
-    if unused := [option(n) for n in numbers if n not in chart.takes]:
-        takes = ", ".join(map(option, chart.takes))
+    if unused := [_FLAGS[n] for n in numbers if n not in chart.takes]:
+        takes = ", ".join(_FLAGS[n] for n in chart.takes)
         raise SelectionError(f"{method} does not use {', '.join(unused)}; it takes {takes}")
     if (known.structure or known.order) and not chart.takes_structure:
         raise SelectionError(f"{method} does not use --structure and --order")
-    for name, value in numbers.items():
-        _require_range(name, value)
+    if zero := [_FLAGS[name] for name in _NOT_ZERO if numbers.get(name) == 0.0]:
+        raise SelectionError(f"{', '.join(zero)} must not be 0")
     return chart.identify(*([known] if chart.takes_structure else []), **numbers)
-
-
-def _require_range(name: str, value: float) -> None:
-    wanted = NUMBERS[name].range
-    good = {ANY: True, POSITIVE: value > 0.0, NOT_NEGATIVE: value >= 0.0, NOT_ZERO: value != 0.0}
-    if not good[wanted] or not math.isfinite(value):
-        raise SelectionError(f"{option(name)} must be finite and {wanted}, found {value:g}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -332,7 +331,7 @@ def _parser() -> argparse.ArgumentParser:
     methods: list[str] = []
     for name, chart in CHART_METHODS.items():
         needed = chart.required
-        numbers = [option(n) if n in needed else f"[{option(n)}]" for n in chart.takes]
+        numbers = [_FLAGS[n] if n in needed else f"[{_FLAGS[n]}]" for n in chart.takes]
         methods += labelled(name, chart.summary, width(), indent=17)
         methods += labelled("", "   ".join(numbers), width(), indent=17)
     parser = argparse.ArgumentParser(
@@ -342,11 +341,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--method", required=True, metavar="NAME", help="how to identify")
-    for name, number in NUMBERS.items():
-        letter = number.unit.upper() if number.unit.isalpha() else "X"
-        parser.add_argument(
-            option(name), type=finite, metavar=letter, help=f"{number.meaning} [{number.unit}]"
-        )
+    add_quantities(parser, NUMBERS)
     parser.add_argument("--structure", default="", metavar="NAME", help="structure of the model")
     parser.add_argument(
         "--order", type=int, default=0, metavar="N", help="number of equal lags of the model"
@@ -356,7 +351,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace) -> int:
-    numbers = {name: value for name in NUMBERS if (value := getattr(options, name)) is not None}
+    numbers = given_quantities(options, NUMBERS)
     known = Known(structure=options.structure, order=options.order)
     found = identify_chart(options.method, numbers, known)
     if options.json:

@@ -14,7 +14,8 @@ import pytest
 from worked_cases import cases
 
 from relay_autotune.cli import identify
-from relay_autotune.cli.identify import CHART_METHODS, NUMBERS, option
+from relay_autotune.cli.arguments import flag_of
+from relay_autotune.cli.identify import CHART_METHODS, NUMBERS
 from relay_autotune.identification.methods import METHODS
 
 EXAMPLE = "--period 33.271862630047444 --amplitude 0.025968976458966186 --relay 0.04"
@@ -108,8 +109,14 @@ WANG = "--method wang --period-high 1 --period-low 1 --peak-max 1 --peak-min -1 
         ("--method chang --period 33", "chang also needs --amplitude, --relay, --dead-time"),
         (f"--method chang {EXAMPLE} --dead-time 10 --bias 1", "does not use --bias"),
         ("--method nonsense --period 3", "unknown method 'nonsense'; known: "),
-        ("--method atv --period -3 --amplitude 1 --relay 1 --dead-time 1", "finite and > 0"),
-        ("--method atv --period 3 --amplitude 1 --relay 1 --dead-time -1", "finite and >= 0"),
+        (
+            "--method atv --period -3 --amplitude 1 --relay 1 --dead-time 1",
+            "--period is -3, expected above 0 s",
+        ),
+        (
+            "--method atv --period 3 --amplitude 1 --relay 1 --dead-time -1",
+            "--dead-time is -1, expected at least 0 s",
+        ),
         ("--method chang --period x", "'x' is not a number"),
         (f"{WANG} --bias 0.1", "also needs --gain, or --mean-measurement and --mean-command"),
         (f"{WANG} --bias 0.1 --structure sopdt", "does not use --structure"),
@@ -147,15 +154,15 @@ def test_numbers_of_no_model(arguments, message):
 def test_the_help_names_every_method_and_number():
     done = run("--help")
     assert done.returncode == 0
-    for name in (*CHART_METHODS, *map(option, NUMBERS)):
+    for name in (*CHART_METHODS, *map(flag_of, NUMBERS)):
         assert name in done.stdout
 
 
 def test_every_number_is_known_and_used():
     for chart in CHART_METHODS.values():
-        assert set(chart.takes) <= NUMBERS.keys()
+        assert set(chart.takes) <= {each.name for each in NUMBERS}
     used = {n for chart in CHART_METHODS.values() for n in chart.takes}
-    assert used == NUMBERS.keys()
+    assert used == {each.name for each in NUMBERS}
 
 
 def test_methods_are_named_as_those_of_records():
