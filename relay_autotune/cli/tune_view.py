@@ -19,9 +19,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, TextIO
 
-from relay_autotune.cli.table import gains_lines
+from relay_autotune.cli.table import gains_lines, identification_lines
 from relay_autotune.cli.terminal import UNITS, WIDEST, labelled
-from relay_autotune.exchange.messages import transfer_function_from_message
+from relay_autotune.exchange.messages import (
+    identification_from_message,
+    transfer_function_from_message,
+)
 from relay_autotune.nodes.shell import prefix
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
@@ -203,8 +206,8 @@ def result_lines(
         left = left or "the plant is left at the safe command"
         lines += labelled("", f"{left}; no gains are given", columns)
     if result.transfer_function.experiment_id:
-        lines += ["", *model_lines(result.transfer_function, paint, columns)]
-    if result.transfer_function.experiment_id:
+        found = identification_from_message(result.transfer_function)
+        lines += ["", *identification_lines(found, columns)]
         lines += ["", *_verdict_lines(result, paint, columns)]
     if result.gains.experiment_id:
         lines += ["", *gains_lines(result.gains, Verdict(result.verdict), columns)]
@@ -225,36 +228,6 @@ def _verdict_lines(result: Any, paint: Paint, columns: int) -> list[str]:
             f"{digits(result.gains.ms_95, 3)} on 95 % of the models that the data allow"
         )
     return lines + (labelled("", told, columns) if told else [])
-
-
-def model_lines(message: Any, paint: Paint, columns: int = WIDEST) -> list[str]:
-    """Return an identified model with its accuracy.
-
-    :param message: a `TransferFunction`.
-    :param paint: the look of text.
-    :param columns: that a line may have.
-    """
-    process = process_text(transfer_function_from_message(message))
-    lines = labelled("process", f"{process}   ({message.structure}, {message.method})", columns)
-    for name, low, high in zip(
-        message.parameters, message.ci95_low, message.ci95_high, strict=True
-    ):
-        if math.isfinite(low):
-            doubt = paint("   not determined", _YELLOW) if name in message.undetermined else ""
-            label = "  " + name.replace("_", " ")
-            lines.append(f"  {label + ' ':<16} 95 %: {digits(low)} to {digits(high)}{doubt}")
-    if math.isfinite(message.ultimate_gain):
-        label = "  ultimate point"
-        lines.append(
-            f"  {label:<16} K_u {digits(message.ultimate_gain)} u/y, "
-            f"w_u {digits(message.ultimate_frequency)} rad/s"
-        )
-    if math.isfinite(message.fit):
-        lines.append(f"  {'  fit':<16} {100.0 * message.fit:.2f} %")
-    for text in message.warnings:
-        first, *rest = labelled("  warning", text, columns)
-        lines += [first.replace("warning", paint("warning", _YELLOW), 1), *rest]
-    return lines
 
 
 def next_commands(
