@@ -9,13 +9,11 @@ Measurement noise in the command, without feedback through the loop, and the fil
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
 from relay_autotune.arrays import FloatArray, IntArray
-from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.law import LawRate, Smoothing, taps_of
 from relay_autotune.loop.sampled import filter_elements
 from relay_autotune.process.transfer_function import TransferFunction
@@ -94,18 +92,6 @@ def filters_of(
     found = np.exp(steps[inside - 1] + share * (steps[inside] - steps[inside - 1])) * h
     found = np.where(first == 0, 0.0, found)
     return np.maximum(least, np.where(first == tried.size, math.inf, found))
-
-
-@dataclass(frozen=True)
-class Optimum:
-    """The controller that a search found.
-
-    :param controller: the gains.
-    :param iae: IAE after a unit step of the load, as computed in the search [y s/u].
-    """
-
-    controller: Controller
-    iae: float
 
 
 def stable_gains(

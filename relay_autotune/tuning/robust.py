@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,11 +15,8 @@ from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop, abscissae, inverted
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.candidates import (
-    Optimum,
-)
 from relay_autotune.tuning.frontier import Bounds
-from relay_autotune.tuning.search import Search
+from relay_autotune.tuning.search import Optimum, Search
 from relay_autotune.tuning.task import MS_RANGE, DesignTask
 
 # PID has to lower the IAE at least this far to be worth its derivative.
@@ -34,16 +32,6 @@ _RESETS, _TURNS = 8.0, 6.0
 # Allowed overshoot, and what is allowed beyond the least overshoot if that is larger: to avoid the
 # last part with b = 0 would make the response much slower.
 _OVERSHOOT, _SPARE = 0.05, 0.02
-
-
-@dataclass(frozen=True)
-class _Attempt:
-    """The best controller of one kind, and what had to be given up for it."""
-
-    optimum: Optimum
-    bounds: Bounds
-    derivative: bool
-    warnings: tuple[str, ...] = ()
 
 
 def robust(task: DesignTask) -> tuple[Controller, str]:
@@ -65,11 +53,11 @@ def robust(task: DesignTask) -> tuple[Controller, str]:
     bounds = Bounds(options.ms, options.largest_mt(task.model))
     search = _search(task)
     if options.controller == "auto" and search.differentiates:
-        controller, reason = _chosen(search, bounds)
+        found, why = _chosen(search, bounds)
     else:
         derivative = options.controller == "pid" and search.differentiates
-        found = _within(search, bounds, derivative) or _relaxed(search, bounds, derivative)
-        controller, reason = found.optimum.controller, _promise(found, search)
+        found, why = _best(search, bounds, derivative), ""
+    controller = found.controller
     # Where a double cannot count the samples of a response, the integral is as good as zero.
     duration = _duration(controller, search.model, search.frequency)
     endless = duration * math.ulp(1.0) > search.rate.period > 0.0
@@ -78,6 +66,7 @@ def robust(task: DesignTask) -> tuple[Controller, str]:
             "no controller with a gain above zero keeps the bounds on the model and those around "
             "it: it is not known well enough; record a longer or larger test"
         )
+    reason = "; ".join(filter(None, (_promise(found, search), why)))
     return with_setpoint_weight(controller, task.loop(controller), search.frequency), reason
 
 
@@ -90,52 +79,41 @@ def _search(task: DesignTask) -> Search:
     return Search(model, task.around, options.filter_ratio, noise, options.rate)
 
 
-def _chosen(search: Search, bounds: Bounds) -> tuple[Controller, str]:
-    """Return PI unless PID is worth it."""
-    pi = _within(search, bounds, False)
+def _chosen(search: Search, bounds: Bounds) -> tuple[Optimum, str]:
+    """Return PI unless PID is worth it, and what is to be known of that."""
+    pi, pid = search.optimum(bounds, derivative=False), None
     if pi is None:
-        pid = _within(search, bounds, True) or _relaxed(search, bounds, True)
-        reason = f"{_promise(pid, search)}; no PI controller keeps the bounds that were asked for"
-        return pid.optimum.controller, reason
-    try:
-        other = _within(search, bounds, True)
-    except TuningError:
-        # Nothing limits the gain of a PID on a model without dead time; the PI is taken.
-        other = None
-    if other is None:
-        return pi.optimum.controller, _promise(pi, search)
-    share = other.optimum.iae / pi.optimum.iae if pi.optimum.iae > 0.0 else math.inf
-    if not math.isfinite(share):
-        # On so uncertain a model the cost of one of them is beyond numbers.
-        return pi.optimum.controller, _promise(pi, search)
-    if share > WORTH:
-        reason = f"PID would still have {100.0 * share:.0f} % of its IAE"
-    elif math.isinf(search.noise):
-        reason = (
-            f"PID would have {100.0 * share:.0f} % of its IAE, and is chosen where noise, "
-            "amplitude and sampling period are given, as by a recording"
+        why = "no PI controller keeps the bounds that were asked for"
+        return _best(search, bounds, True), why
+    # Nothing may limit the gain of a PID on a model without dead time.
+    with suppress(TuningError):
+        pid = search.optimum(bounds, derivative=True)
+    # On so uncertain a model the cost of one of them may be beyond numbers.
+    if pid is None or not (pi.iae > 0.0 and math.isfinite(pid.iae / pi.iae)):
+        return pi, ""
+    share = 100.0 * pid.iae / pi.iae
+    if share > 100.0 * WORTH:
+        return pi, f"PID would still have {share:.0f} % of its IAE"
+    if math.isinf(search.noise):
+        return pi, (
+            f"PID would have {share:.0f} % of its IAE, and is chosen where noise, amplitude and "
+            "sampling period are given, as by a recording"
         )
-    else:
-        reason = f"{_promise(other, search)}; its IAE is {100.0 * share:.0f} % of that of PI"
-        return other.optimum.controller, reason
-    return pi.optimum.controller, f"{_promise(pi, search)}; {reason}"
+    return pid, f"its IAE is {share:.0f} % of that of PI"
 
 
-def _within(search: Search, bounds: Bounds, derivative: bool) -> _Attempt | None:
-    """Return the best controller that keeps all limits, None where none does."""
-    optimum = search.optimum(bounds, derivative=derivative)
-    return None if optimum is None else _Attempt(optimum, bounds, derivative)
-
-
-def _relaxed(search: Search, asked: Bounds, derivative: bool) -> _Attempt:
-    """Return the best controller within the tightest bounds that leave room for one.
+def _best(search: Search, asked: Bounds, derivative: bool) -> Optimum:
+    """Return the best controller within bounds, or the tightest that leave room for one.
 
     :raises TuningError: if none holds the process.
     """
+    found = search.optimum(asked, derivative=derivative)
+    if found is not None:
+        return found
     kind, warnings = _KINDS[derivative], []
     if math.isfinite(search.noise):
         quiet = replace(search, noise=math.inf)
-        found = _within(quiet, asked, derivative)
+        found = quiet.optimum(asked, derivative=derivative)
         warning = (
             "no controller keeps both the bounds and the limit of the noise in the command: the "
             "noise is not limited; a smaller noise_std, a larger noise_share or a slower sensor "
@@ -150,11 +128,11 @@ def _relaxed(search: Search, asked: Bounds, derivative: bool) -> _Attempt:
     ms = _RELAXED * least_ms if least_ms > asked.ms else asked.ms
     least_mt = search.least_mt(ms, derivative=derivative)
     mt = _RELAXED * least_mt if least_mt > asked.mt else asked.mt
-    found = _within(search, Bounds(ms, mt), derivative)
+    found = search.optimum(Bounds(ms, mt), derivative=derivative)
     if found is None:
         # Some controllers keep the bounds, but too few for the scan to find one.
         ms, mt = max(ms, _RELAXED * least_ms), max(mt, _RELAXED * least_mt)
-        found = _within(search, Bounds(ms, mt), derivative)
+        found = search.optimum(Bounds(ms, mt), derivative=derivative)
     if found is None:
         raise TuningError(_cannot_hold(search, kind, math.inf))
     if ms > asked.ms:
@@ -189,16 +167,16 @@ def _cannot_hold(search: Search, kind: str, least: float) -> str:
     )
 
 
-def _promise(attempt: _Attempt, search: Search) -> str:
-    bounds, around = attempt.bounds, search.models
+def _promise(found: Optimum, search: Search) -> str:
+    bounds, around = found.bounds, search.models
     where = "on the model"
     if around:
         where += f" and on 95 % of {len(around)} models within its uncertainty"
     promise = (
-        f"{_KINDS[attempt.derivative]} with the smallest IAE after a load step, with Ms <= "
+        f"{_KINDS[found.derivative]} with the smallest IAE after a load step, with Ms <= "
         f"{bounds.ms:.3g} and Mt <= {bounds.mt:.3g} {where}"
     )
-    return "; ".join((promise, *attempt.warnings))
+    return "; ".join((promise, *found.warnings))
 
 
 def _duration(controller: Controller, model: TransferFunction, frequency: float) -> float:

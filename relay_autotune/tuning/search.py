@@ -38,7 +38,7 @@ from relay_autotune.loop.stability import peaks
 from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.tuning.candidates import Optimum, Surroundings, filters_of, stable_gains
+from relay_autotune.tuning.candidates import Surroundings, filters_of, stable_gains
 from relay_autotune.tuning.frontier import Bounds, Candidates, Responses, design_grid
 
 _POINTS = 512
@@ -140,6 +140,24 @@ _NO_LIMIT = (
     "nothing limits the gain of a controller on this model, which has no dead time: give the "
     "controller's sampling period or the loop's delay"
 )
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The best controller of one kind, and what had to be given up for it.
+
+    :param controller: the gains.
+    :param iae: IAE after a unit step of the load, as computed in the search [y s/u].
+    :param bounds: that it keeps.
+    :param derivative: True: PID, False: PI.
+    :param warnings: what it does not keep, each a sentence.
+    """
+
+    controller: Controller
+    iae: float
+    bounds: Bounds
+    derivative: bool
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -262,7 +280,7 @@ class Search:
             best, iae = found
         if best.kp[0] > _UNLIMITED * self._largest_kp:
             raise TuningError(_NO_LIMIT)
-        return Optimum(self._controller(best), iae)
+        return Optimum(self._controller(best), iae, bounds, derivative)
 
     def _among_models(
         self, bounds: Bounds, point: FloatArray, asked: Surroundings
