@@ -35,7 +35,7 @@ from markdown import table, three
 
 from relay_autotune.analysis import analyse
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.loop.analysis import ms_on
+from relay_autotune.loop.analysis import Loop
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.record import Record
 from relay_autotune.recordings import read_records
@@ -158,7 +158,7 @@ def shares(pairs: Sequence[list[Half]]) -> Iterable[tuple[str, str]]:
                     continue
                 process = model.model
                 process = replace(process, dead_time=process.dead_time + one.found.added_delay)
-                held.append(ms_on(gains, process) <= _HOLDS)
+                held.append(Loop(gains, process).ms() <= _HOLDS)
         which = "trusted gains" if trusted else "all gains"
         yield f"{which} of a half, Ms at most 2 on the other half's model", _share(held)
     for title, name in (("K_u", "K_u"), ("tau", "time_constant"), ("D", "dead_time")):

@@ -465,12 +465,3 @@ def difference(present: Performance | None, new: Performance) -> str:
     )
     more = "; where the present loop is calm enough, ask for faster ones with a larger ms"
     return told + more * (quick < 0 < calm)
-
-
-def ms_on(controller: ControlLaw, model: TransferFunction) -> float:
-    """Return Ms of a controller on any model; infinite where the loop is unstable.
-
-    :param controller: the gains, or any other linear controller.
-    :param model: the process, with all dead time of the loop.
-    """
-    return Loop(controller, model).ms()

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from relay_autotune.loop.analysis import ms_on
+from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
@@ -214,7 +214,7 @@ def test_the_truth_of_first_tries_is_that_of_the_exact_loop() -> None:
     model = TransferFunction.sopdt(gain, (slow, fast), late)
     for kc, ti in ((0.8, 10.0), (1.6, 6.0)):
         gains = Controller(kc, ti)
-        assert truth.ms(gains) == pytest.approx(ms_on(gains, model), rel=1e-3)
+        assert truth.ms(gains) == pytest.approx(Loop(gains, model).ms(), rel=1e-3)
     assert math.isinf(truth.ms(Controller(20.0, 2.0)))
     assert 0.02 < truth.best_integral() < 0.2
 

@@ -24,7 +24,7 @@ from relay_autotune.experiment.faults import (
 )
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.known import Known
-from relay_autotune.loop.analysis import ms_on
+from relay_autotune.loop.analysis import Loop
 from relay_autotune.process.structures import UNSTABLE_FOPDT, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
@@ -165,7 +165,7 @@ def test_of_both_levels_clipped_alike_only_gains_that_hold_are_trusted(known, sh
         found = analyse(tune.record(), known=known, alone=True)
         # In the larger noise nothing tells six tenths of the effect from a smaller gain.
         gains, process = found.best_gains, TransferFunction.fopdt(1.65, 20.0, 10.0)
-        hold = gains is not None and ms_on(gains, process) < 1.8
+        hold = gains is not None and Loop(gains, process).ms() < 1.8
         assert hold or found.verdict is not Verdict.TRUSTED
 
 

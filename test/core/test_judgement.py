@@ -27,7 +27,7 @@ from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import Part
-from relay_autotune.loop.analysis import ms_on
+from relay_autotune.loop import analysis
 from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import UNSTABLE_FOPDT, GivenModel
@@ -245,10 +245,10 @@ def test_halves_that_differ_as_much_as_their_noise_are_not_told(dead_time):
 def test_gains_hold_on_both_halves_of_a_process_that_changed():
     other = TransferFunction.fopdt(2.0, 10.0, 5.0)
     gains = analyse(joined(PROCESS, other), known=Known(structure="fopdt"), alone=True).best_gains
-    assert max(ms_on(gains, PROCESS), ms_on(gains, other)) < 1.5
+    assert max(analysis.Loop(gains, PROCESS).ms(), analysis.Loop(gains, other).ms()) < 1.5
     # Those for the first half alone would not.
     alone = analyse(steps(PROCESS), known=Known(structure="fopdt"), alone=True).best_gains
-    assert ms_on(alone, other) > 1.7
+    assert analysis.Loop(alone, other).ms() > 1.7
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import pytest
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.judgement.difference import Difference, widened
 from relay_autotune.identification.result import identified
-from relay_autotune.loop.analysis import ms_on
+from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.process.model_set import ModelErrors, ModelSet
@@ -80,9 +80,9 @@ def test_the_ms_with_an_error_is_that_of_the_process(period, kc, stable):
 def test_the_design_holds_on_the_models_with_their_errors():
     around = DesignTask(model=MODEL, models=(MODEL,) * 20, errors=errors(20))
     gains, _ = robust(around)
-    assert ms_on(gains, TRUTH) == pytest.approx(1.4, rel=0.01)
+    assert Loop(gains, TRUTH).ms() == pytest.approx(1.4, rel=0.01)
     # Without them it would not.
-    assert ms_on(robust(DesignTask(model=MODEL))[0], TRUTH) > 1.8
+    assert Loop(robust(DesignTask(model=MODEL))[0], TRUTH).ms() > 1.8
 
 
 def test_the_interval_of_the_ultimate_gain_holds_what_is_shown_beside_the_model():

@@ -8,7 +8,7 @@ import pytest
 
 from relay_autotune import Known, Record, identify
 from relay_autotune.analysis import analyse
-from relay_autotune.loop.analysis import ms_on
+from relay_autotune.loop.analysis import Loop
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import INTEGRATOR_LAG
 from relay_autotune.process.transfer_function import TransferFunction
@@ -38,7 +38,7 @@ def test_a_stop_is_no_rest(noise):
     # Gains of a process that would come to rest at the stop made this one grow.
     found = analyse(recorded(AXIS, [3.0], [1.0], end=30.0, noise=noise), alone=True)
     assert told_of_a_stop(found.model)
-    assert found.best_gains is None or ms_on(found.best_gains, AXIS) < 1.75
+    assert found.best_gains is None or Loop(found.best_gains, AXIS).ms() < 1.75
 
 
 def test_what_lies_at_the_end_of_a_sensor_is_left_out():
