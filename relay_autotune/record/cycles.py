@@ -54,7 +54,6 @@ class RelayStretch:
     :param low: the lower level [u].
     :param high: the upper level [u].
     :param first: index of the first sample at one of the levels.
-    :param last: index of the last one.
     :param up: indices of the samples answered by a switch from low to high, shape (m,), m >= 2.
     :param down: indices of the samples answered by a switch from high to low, shape (k,).
     """
@@ -62,7 +61,6 @@ class RelayStretch:
     low: float
     high: float
     first: int
-    last: int
     up: IntArray
     down: IntArray
 
@@ -79,7 +77,7 @@ def find_cycles(record: Record) -> tuple[int, ...]:
     :returns: indices as in ``Record.cycle_start``; empty if the command does not switch to a
         high level from a low one at least twice, or by the clock.
     """
-    stretch = _find_following(record)
+    stretch = find_relay(record)
     return () if stretch is None else tuple(int(i) for i in stretch.up)
 
 
@@ -97,7 +95,7 @@ def infer_settings(record: Record) -> RelaySettings | None:
     :param record: a record of any origin.
     :returns: the settings, or None if the command is not that of a relay.
     """
-    stretch = _find_following(record)
+    stretch = find_relay(record)
     if stretch is None or stretch.down.size == 0:
         return None
     y = record.measurement
@@ -150,7 +148,8 @@ def find_relay(record: Record) -> RelayStretch | None:
     """Return the longest stretch in which the command switches between two levels.
 
     :param record: a record of any origin.
-    :returns: the stretch; None without two switches from a lower to a higher level.
+    :returns: the stretch; None without two switches from a lower to a higher level, or if they
+        come by the clock.
     """
     command = record.command
     change = np.flatnonzero(np.diff(command) != 0.0) + 1
@@ -164,7 +163,11 @@ def find_relay(record: Record) -> RelayStretch | None:
     # Command changes within one level are no switches.
     begins = begins[np.concatenate(([True], np.abs(np.diff(values)) > tolerance))]
     begin, stop = max(two_level_runs(command[begins]), key=lambda run: run[1] - run[0])
-    return _stretch(record, begins, slice(begin, stop + 1))
+    stretch = _stretch(record, begins, slice(begin, stop + 1))
+    if stretch is None:
+        return None
+    at = np.sort(np.append(stretch.up, stretch.down))
+    return stretch if follow_measurement(record, at, np.isin(at, stretch.up)) else None
 
 
 def two_level_runs(levels: FloatArray) -> list[tuple[int, int]]:
@@ -174,15 +177,6 @@ def two_level_runs(levels: FloatArray) -> list[tuple[int, int]]:
     """
     same = np.abs(levels[2:] - levels[:-2]) <= _LEVEL_TOLERANCE * np.ptp(levels)
     return list(pairwise([0, *(1 + np.flatnonzero(~same)).tolist(), levels.size - 1]))
-
-
-def _find_following(record: Record) -> RelayStretch | None:
-    """Return the stretch of :func:`find_relay`, unless its switches come by the clock."""
-    stretch = find_relay(record)
-    if stretch is None:
-        return None
-    at = np.sort(np.append(stretch.up, stretch.down))
-    return stretch if follow_measurement(record, at, np.isin(at, stretch.up)) else None
 
 
 def follow_measurement(record: Record, at: IntArray, rises: NDArray[np.bool_]) -> bool:
@@ -258,7 +252,6 @@ def _stretch(record: Record, begins: IntArray, stays: slice) -> RelayStretch | N
         low=float(np.min(value)),
         high=float(np.max(value)),
         first=int(starts[0]),
-        last=last,
         up=np.array(up, dtype=np.int64),
         down=np.array(down, dtype=np.int64),
     )
@@ -440,21 +433,12 @@ def next_cycle(
 
 
 @cached_on_record
-def cycles_of(
-    record: Record, *, min_cycles: int = MIN_CYCLES, tolerance: float = TOLERANCE
-) -> tuple[Cycle, ...]:
-    """Compute the whole cycles of a record.
-
-    The cycles are bounded by ``record.cycle_start``. If that is empty and the outcome is unknown
-    (a truncated recording, or one of another program), they are bounded by the switches of the
-    command, see :func:`~relay_autotune.record.cycles.find_cycles`, and missing settings are
-    inferred.
+def cycles_of(record: Record) -> tuple[Cycle, ...]:
+    """Compute the whole cycles of a record; missing settings are inferred.
 
     :param record: the record of an experiment.
-    :param min_cycles: number of successive cycles that must agree for ``converged``.
-    :param tolerance: relative difference allowed between them, see :func:`agree`.
     """
-    bounds = _bounds(record)
+    bounds = cycle_bounds(record)
     settings = settings_of(record)
     if settings is None or len(bounds) < 2:
         return ()
@@ -472,11 +456,18 @@ def cycles_of(
             len(cycles), time, y, sent, middle=middle, reverse_acting=reverse
         )
         interval, noise = cycle.period / (last - first), record.noise_std
-        cycles.append(next_cycle(cycles, cycle, interval, noise, min_cycles, tolerance))
+        cycles.append(next_cycle(cycles, cycle, interval, noise, MIN_CYCLES, TOLERANCE))
     return tuple(cycles)
 
 
-def _bounds(record: Record) -> tuple[int, ...]:
+def cycle_bounds(record: Record) -> tuple[int, ...]:
+    """Return the samples at which the cycles of a record begin, and at which the last one ends.
+
+    They are ``record.cycle_start``. If that is empty and the outcome is unknown (a truncated
+    recording, or one of another program), they are those of :func:`find_cycles`.
+
+    :param record: the record of an experiment.
+    """
     if record.cycle_start or record.outcome is not Outcome.UNKNOWN:
         return record.cycle_start
     return find_cycles(record)
@@ -497,30 +488,23 @@ class LimitCycle(CycleFeatures):
 _AVERAGED = tuple(f.name for f in fields(CycleFeatures))
 
 
-def limit_cycle(
-    source: Record | Sequence[Cycle], *, min_cycles: int = MIN_CYCLES, tolerance: float = TOLERANCE
-) -> LimitCycle:
+def limit_cycle(source: Record | Sequence[Cycle]) -> LimitCycle:
     """Average the cycles of the limit cycle.
 
-    These are the last unbroken run of converged cycles and the ``min_cycles - 1`` cycles before
-    it, with which they agree. Without a converged cycle they are the last ``min_cycles``.
-    Disturbed cycles are left out if others remain.
+    These are the last unbroken run of converged cycles and the two cycles before it, with which
+    they agree. Without a converged cycle they are the last three. Disturbed cycles are left out
+    if others remain.
 
     :param source: a record, or its cycles.
-    :param min_cycles: number of successive cycles that had to agree.
-    :param tolerance: relative difference allowed between them; used if a record is given.
     :raises RecordError: if there is no whole cycle.
     """
-    if isinstance(source, Record):
-        cycles = cycles_of(source, min_cycles=min_cycles, tolerance=tolerance)
-    else:
-        cycles = tuple(source)
+    cycles = cycles_of(source) if isinstance(source, Record) else tuple(source)
     if not cycles:
         raise RecordError(
             "found no whole cycle, expected at least one: the command must switch to its high "
             "level twice or more"
         )
-    chosen, converged = _steady_cycles(cycles, min_cycles)
+    chosen, converged = _steady_cycles(cycles)
     values = {name: np.array([getattr(c, name) for c in chosen]) for name in _AVERAGED}
     spread = {n: float(np.std(v, ddof=1)) if v.size > 1 else 0.0 for n, v in values.items()}
     return LimitCycle(
@@ -531,13 +515,13 @@ def limit_cycle(
     )
 
 
-def _steady_cycles(cycles: tuple[Cycle, ...], min_cycles: int) -> tuple[tuple[Cycle, ...], bool]:
+def _steady_cycles(cycles: tuple[Cycle, ...]) -> tuple[tuple[Cycle, ...], bool]:
     last = max((k for k, c in enumerate(cycles) if c.converged), default=None)
     if last is None:
-        chosen = cycles[-min_cycles:]
+        chosen = cycles[-MIN_CYCLES:]
     else:
         first = last
         while first > 0 and cycles[first - 1].converged:
             first -= 1
-        chosen = cycles[max(0, first + 1 - min_cycles) : last + 1]
+        chosen = cycles[max(0, first + 1 - MIN_CYCLES) : last + 1]
     return tuple(c for c in chosen if not c.disturbed) or chosen, last is not None

@@ -84,7 +84,7 @@ def test_periods_converge_to_the_closed_forms_with_the_sample_period(gain):
     for period in (0.04, 0.02, 0.01, 0.005):
         tune = experiment(hysteresis=0.1, min_cycles=4)
         run(tune, FopdtPlant(gain, 2.0, 2.0), period)
-        cycle = limit_cycle(tune.record(), min_cycles=4)
+        cycle = limit_cycle(tune.record())
         truth = wang_limit_cycle(1.0, 2.0, 2.0, 1.0, 0.3, 0.1)
         errors.append(abs(cycle.period - truth[0] - truth[1]) / period)
     assert max(errors) < 2.1

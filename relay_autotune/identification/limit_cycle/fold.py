@@ -30,7 +30,7 @@ from scipy.special import stdtrit
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import carried
-from relay_autotune.record.cycles import find_cycles, limit_cycle, settings_of
+from relay_autotune.record.cycles import cycle_bounds, limit_cycle, settings_of
 from relay_autotune.record.record import Record, RelaySettings, cached_on_record
 from relay_autotune.scalar import minimum_near
 
@@ -319,28 +319,21 @@ class Fold:
         return np.asarray(y / unit if derivative else y)
 
 
-def fold(
-    record: Record,
-    cycles: tuple[int, ...] = (),
-    *,
-    sharp: bool = False,
-    left_out: int | None = None,
-) -> Fold:
+def fold(record: Record, *, sharp: bool = False, left_out: int | None = None) -> Fold:
     """Average the steady cycles of a relay test.
 
     :param record: with at least one whole cycle.
-    :param cycles: numbers of the cycles to be averaged; default: those of the limit cycle.
     :param sharp: True if there is a kink for certain, so that only its place is decided.
     :param left_out: number of a cycle that is left out, with the knots of the average of all and
         the kink near theirs; None: none.
     :raises IdentificationError: if the record holds no whole cycle, or too few samples in it.
     """
-    if settings_of(record) is None or len(record.cycle_start or find_cycles(record)) < 2:
+    if settings_of(record) is None or len(cycle_bounds(record)) < 2:
         raise IdentificationError(
             "the shape of a limit cycle needs at least one whole cycle of a relay test and the "
             "record holds none: use the method waveform, which takes any input"
         )
-    return _averaged(record, cycles or limit_cycle(record).cycles, sharp, left_out)
+    return _averaged(record, sharp, left_out)
 
 
 # Least number of cycles that have a scatter; of many, not every one is left out.
@@ -364,23 +357,21 @@ class Reading:
     def of(
         cls,
         record: Record,
-        cycles: tuple[int, ...],
         measure: Callable[[Fold], FloatArray],
         *,
         sharp: bool = False,
     ) -> Reading:
         """Measure an averaged period; the scatter is that of leaving out each cycle once.
 
-        :param record: with whole cycles.
-        :param cycles: numbers of the cycles that are averaged; fewer than three have no scatter.
+        :param record: with whole cycles; fewer than three have no scatter.
         :param measure: from an averaged period to numbers, shape (n,).
         :param sharp: as for :func:`fold`.
         """
-        count = len(cycles)
-        values, covariance = measure(fold(record, cycles, sharp=sharp)), None
+        cycles = limit_cycle(record).cycles
+        count, values, covariance = len(cycles), measure(fold(record, sharp=sharp)), None
         if count >= LEAST_CYCLES:
             left_out = cycles[:: -(-count // _MOST_PARTS)]
-            folds = [fold(record, cycles, sharp=sharp, left_out=c) for c in left_out]
+            folds = [fold(record, sharp=sharp, left_out=c) for c in left_out]
             parts = np.array([measure(each) for each in folds])
             away = parts - np.mean(parts, axis=0)
             covariance = np.asarray(away.T @ away * (count - 1) / len(parts))
@@ -425,13 +416,12 @@ class Reading:
 
 
 @cached_on_record
-def _averaged(record: Record, cycles: tuple[int, ...], sharp: bool, left_out: int | None) -> Fold:
+def _averaged(record: Record, sharp: bool, left_out: int | None) -> Fold:
     settings = settings_of(record)
     assert settings is not None
-    bounds = record.cycle_start or find_cycles(record)
-    chosen = tuple(c for c in cycles if c != left_out)
-    like = None if left_out is None else _averaged(record, cycles, sharp, None)
-    since, is_high, y, high, low = _overlaid(record, settings, bounds, chosen)
+    chosen = [c for c in limit_cycle(record).cycles if c != left_out]
+    like = None if left_out is None else _averaged(record, sharp, None)
+    since, is_high, y, high, low = _overlaid(record, settings, chosen)
     mirrored = abs(settings.bias) <= NO_BIAS * settings.amplitude and abs(
         high - low
     ) <= SYMMETRIC * (high + low)
@@ -457,10 +447,10 @@ def as_switched(seen: Fold) -> RelaySettings:
 
 
 def _overlaid(
-    record: Record, settings: RelaySettings, bounds: tuple[int, ...], chosen: tuple[int, ...]
+    record: Record, settings: RelaySettings, chosen: Sequence[int]
 ) -> tuple[FloatArray, NDArray[np.bool_], FloatArray, float, float]:
     """Return of all samples the time since the last switch, the level and y; mean half periods."""
-    middle = settings.baseline + settings.bias
+    middle, bounds = settings.baseline + settings.bias, cycle_bounds(record)
     since, is_high, y, highs, lows = [], [], [], [], []
     for index in chosen:
         first, last = bounds[index], bounds[index + 1]

@@ -24,8 +24,8 @@ from relay_autotune.identification.limit_cycle.fold import (
 )
 from relay_autotune.record.cycles import (
     LimitCycle,
+    cycle_bounds,
     cycles_of,
-    find_cycles,
     limit_cycle,
     settings_of,
 )
@@ -107,7 +107,7 @@ class RelayTest:
             amplitude = 0.5 * (high - low)
             return np.array((seen.period, amplitude, seen.switching[1], more(seen, amplitude)))
 
-        found = Reading.of(self.record, self.cycle.cycles, measure)
+        found = Reading.of(self.record, measure)
         # In noise the level may be below zero, where no relay switches; its scatter is to both
         # sides.
         found.values[2] = min(max(found.values[2], 0.0), MOST_LEVEL * found.values[1])
@@ -139,7 +139,7 @@ def relay_test(method: str, record: Record, *, two_levels: bool = True) -> Relay
         or a command of more than two levels.
     """
     settings = settings_of(record)
-    bounds = record.cycle_start or find_cycles(record)
+    bounds = cycle_bounds(record)
     cycles = cycles_of(record)
     if settings is None or not cycles:
         raise IdentificationError(

@@ -26,7 +26,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.limit_cycle.fold import Fold, Reading, fold
 from relay_autotune.process.simulation import HalfCycle
-from relay_autotune.record.cycles import cycles_of, limit_cycle, settings_of
+from relay_autotune.record.cycles import cycles_of, settings_of
 from relay_autotune.record.record import Record, cached_on_record
 from relay_autotune.scalar import minimum_near, roots
 
@@ -379,7 +379,7 @@ def read_shape(record: Record, *, sharp: bool = False) -> tuple[Shape, Reading]:
         return np.array([getattr(found, name) for name in VARYING])
 
     shape = shape_of_record(record, sharp=sharp)
-    return shape, Reading.of(record, limit_cycle(record).cycles, numbers, sharp=sharp)
+    return shape, Reading.of(record, numbers, sharp=sharp)
 
 
 @dataclass(frozen=True)

@@ -76,16 +76,16 @@ def read_dead_time(test: RelayTest, known: Known) -> tuple[float, float, str]:
     """
     if not math.isnan(known.dead_time):
         return known.dead_time, 0.0, ""
-    settings, cycles = test.settings, test.cycle.cycles
+    settings = test.settings
     if _is_sharp(test):
-        edge = Reading.of(test.record, cycles, lambda seen: np.array([seen.edge]))
+        edge = Reading.of(test.record, lambda seen: np.array([seen.edge]))
         value = max(float(edge.values[0]) - settings.extra_delay, 0.0)
         source = (
             f"the dead time of {value:.4g} s was read as the time from the switch to the sharp "
             "peak; give it where it is known better, since these equations are sensitive to it"
         )
         # An edge lies between two samples, whatever the cycles agree on.
-        between = test.record.interval / math.sqrt(12.0 * len(cycles))
+        between = test.record.interval / math.sqrt(12.0 * edge.cycles)
         scatter = float(np.nan_to_num(edge.std[0]))
         return value, max(scatter, between), source
     first, interval = _first_response(test)
@@ -108,7 +108,7 @@ def _is_sharp(test: RelayTest) -> bool:
         shape = shape_of_record(test.record)
     except IdentificationError:
         return False
-    return not math.isnan(fold(test.record, test.cycle.cycles).edge) and shape.category == "1a"
+    return not math.isnan(fold(test.record).edge) and shape.category == "1a"
 
 
 def _first_response(test: RelayTest) -> tuple[float, float]:
@@ -445,6 +445,6 @@ def shape_misfit(
     half = 0.5 * cycle.period
     time = half * (np.arange(_SHAPE_POINTS) + 0.5) / _SHAPE_POINTS
     process = model.build((*solution, cycle.dead_time))
-    seen = fold(test.record, test.cycle.cycles)
+    seen = fold(test.record)
     away = HalfCycle(process, half, cycle.relay)(time) - seen.half(time)
     return math.hypot(float(np.sqrt(np.mean(away**2))), seen.noise_std) / cycle.amplitude

@@ -333,7 +333,7 @@ def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
         halves = (seen.period_high, seen.period_low)[::sign]
         return np.array((*halves, *seen.peaks(), *seen.switching, gain.value, 0.0))
 
-    reading = Reading.of(record, test.cycle.cycles, measure)
+    reading = Reading.of(record, measure)
     # Noise may put the levels in the order in which no relay switches.
     reading.values[5] = max(reading.values[5], 0.0)
     reading = reading.with_number(6, gain.value, gain.scatter)
