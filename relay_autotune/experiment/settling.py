@@ -24,6 +24,12 @@ _REMAINDER = 0.01
 # Latest end of the settling that is told, as a multiple of the time so far.
 _FURTHEST = 20.0
 
+# Samples in each mean that shows a slow movement.
+_BLOCK = 5
+# Standard deviations of white noise that such means may differ by: the range of ten exceeds
+# it once in 200,000 times.
+_MOVED_BY = 4.0
+
 # Rounding of a constant: differences below this many units in the last place are no signal.
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 
@@ -122,6 +128,21 @@ def rest_state(time: FloatArray, measurement: FloatArray, window: int) -> RestSt
     if noise <= rounding:
         noise = 0.0
     return RestState(mean, rise / span, noise, span, window, range_seen)
+
+
+def slow_movement(measurement: FloatArray) -> tuple[float, float]:
+    """Return how far samples move slowly, and how far noise alone may seem to move them [y, y].
+
+    The movement is the range of the means of five samples each, whatever its course: a transient
+    that dies out, or that returns, has a small slope in the end. The noise is that of the second
+    differences, which a slow movement does not enlarge as it does the scatter about a line.
+
+    :param measurement: samples at equal intervals, the newest last [y], shape (n,), n >= 10.
+    """
+    blocks = measurement[len(measurement) % _BLOCK :].reshape(-1, _BLOCK).mean(axis=1)
+    # White noise of variance 1 has second differences of variance 1 + 4 + 1.
+    noise = math.sqrt(float(np.mean(np.diff(measurement, 2) ** 2)) / 6.0)
+    return float(np.ptp(blocks)), _MOVED_BY * noise
 
 
 class RestWatch:

@@ -22,7 +22,7 @@ from relay_autotune.control.verification import Plan, Step, compare, plan
 from relay_autotune.errors import NotReadyError, RelayAutotuneError
 from relay_autotune.exchange.fields import float64_array
 from relay_autotune.exchange.messages import fill_reason, reason_from_message, set_stamp
-from relay_autotune.experiment.settling import rest_state
+from relay_autotune.experiment.settling import rest_state, slow_movement
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.goals import Narrator, OneGoal, conclude
@@ -37,6 +37,8 @@ from relay_autotune_msgs.msg import Verification
 # Number of samples before a step, for the loop's rest and noise.
 _BEFORE = 50
 _LEAST_BEFORE = 10
+# A loop at rest moves by less than this part of a step.
+_STILL = 0.1
 # Longest silence of the measurement: a time [s], or a number of usual intervals if that is longer.
 _SILENCE = 2.0
 _SILENT_INTERVALS = 20.0
@@ -407,8 +409,10 @@ class Verifier:
             raise NotReadyError(Code.STEP_TIME_STANDS())
         found = rest_state(t - t[0], y, len(t))
         smallest = min((abs(s.setpoint) for s in steps if s.setpoint), default=math.inf)
-        if found.drift > max(4.0 * found.noise_std, 0.1 * smallest):
-            raise NotReadyError(Code.NOT_AT_REST(drift=found.drift, samples=len(self._recent)))
+        moved, by_noise = slow_movement(y)
+        # What is left of a transient shifts the rest, and would count as noise.
+        if moved > max(by_noise, _STILL * smallest):
+            raise NotReadyError(Code.NOT_AT_REST(drift=moved, samples=len(self._recent)))
         return Rest(found.mean, float(u.mean()), found.noise_std), period
 
     # While it runs.

@@ -13,7 +13,7 @@ import pytest
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.phases import State
-from relay_autotune.experiment.settling import RestWatch
+from relay_autotune.experiment.settling import RestWatch, slow_movement
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import Outcome
@@ -109,3 +109,23 @@ def test_what_moved_before_the_rest_does_not_hide_that_it_leaves():
     watch = RestWatch(moved)
     told = [watch.leaves(6.0 + 0.01 * k + noise[200 + k]) for k in range(60)]
     assert told[-1] and watch.rested_at == pytest.approx(6.0, abs=0.01)
+
+
+@pytest.mark.parametrize("period", [40.0, 60.0, 1e9])
+def test_a_loop_that_still_swings_back_is_not_at_rest(period):
+    """The line through a transient is level where it returns, and scatters a lot."""
+    samples = np.arange(50.0)
+    noise = np.random.default_rng(3).standard_normal((300, 50))
+    swing = 8.0 * np.exp(-samples / 20.0) * np.cos(2.0 * np.pi * samples / period)
+    moved, allowed = np.transpose([slow_movement(0.15 * n + swing) for n in noise])
+    assert np.all(moved > 3.0 * allowed)
+    # The noise is seen behind it.
+    assert np.median(allowed) == pytest.approx(4.0 * 0.15, rel=0.2)
+
+
+@pytest.mark.parametrize("samples", [10, 13, 50])
+def test_white_noise_is_at_rest_wherever_it_is(samples):
+    noise = np.random.default_rng(4).standard_normal((500, samples))
+    at_rest = [np.less_equal(*slow_movement(20.0 + 3.0 * n)) for n in noise]
+    assert np.mean(at_rest) > 0.99
+    assert slow_movement(np.full(samples, 0.1))[0] == pytest.approx(0.0, abs=1e-15)
