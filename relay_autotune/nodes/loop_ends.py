@@ -331,6 +331,12 @@ class LoopSupervisor:
         return self._node.get_parameter(name).value
 
     @property
+    def _controller_timeout(self) -> float:
+        """Longest silence of a present controller [s]; one that answers samples waits for them."""
+        by_rate = watch.SILENT_INTERVALS * self._sensor.samples.interval
+        return max(float(self._value("controller_timeout")), by_rate)
+
+    @property
     def is_driven(self) -> bool:
         """True while another node's commands reach the actuator."""
         tuning = self._experiment is not None and self._ends.setpoint is None
@@ -339,7 +345,7 @@ class LoopSupervisor:
     @property
     def is_connected(self) -> bool:
         """True if commands of a present controller arrive on controller_command."""
-        return not self._takeover and self.handover.age <= self._value("controller_timeout")
+        return not self._takeover and self.handover.age <= self._controller_timeout
 
     def mean_command(self) -> float:
         """Return the mean of the present controller's last commands [u]; NaN without controller.
@@ -360,7 +366,7 @@ class LoopSupervisor:
         if self._ends.setpoint is not None and not self.is_connected:
             raise NotReadyError(Code.NO_CONTROLLER())
         if self._takeover and self._driven:
-            if self.handover.age <= self._value("controller_timeout"):
+            if self.handover.age <= self._controller_timeout:
                 raise NotReadyError(Code.BUSY_COMMAND(topic=self._topic))
         elif problem := self._second_commander():
             raise NotReadyError(problem)
@@ -453,7 +459,7 @@ class LoopSupervisor:
         ends = self._ends
         topic = (ends.measurement if ends.is_reported else self._controller).topic_name
         silent = partial(Code.SILENT_CONTROLLER, topic=topic)
-        return watch.silence(silent, self._value("controller_timeout"), self.handover.age)
+        return watch.silence(silent, self._controller_timeout, self.handover.age)
 
     def _silent_feedback(self) -> Reason | None:
         if self._follow is None:
@@ -517,7 +523,7 @@ class LoopSupervisor:
     def _hold_for_silent_controller(self) -> None:
         if self._takeover or self._ends.is_reported or not self.is_driven:
             return
-        timeout = self._value("controller_timeout")
+        timeout = self._controller_timeout
         if self.handover.age <= timeout:
             return
         given = self._value("safe_command")

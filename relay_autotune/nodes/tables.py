@@ -59,8 +59,8 @@ NODE_PARAMETERS = (
         "Half width of that interval as a fraction of the value, for stop_when confident."
     ),
     Quantity("controller_timeout", 1.0, "s", 1e-3).means(
-        "Longest silence of controller_command while it counts as connected; after a longer "
-        "silence the safe command is sent."
+        "Longest silence of controller_command while it counts as connected, or five intervals of "
+        "the measurement where that is longer; after a longer silence the safe command is sent."
     ),
     Quantity("return_time", 0.0, "s", 0.0).means(
         "Time in which the command returns to the controller's after a tune; 0: the last period "

@@ -184,6 +184,34 @@ def test_a_relay_node_that_passes_commands_on_begins_and_ends_at_known_ones(rig:
     rig.until(lambda: commands[-1].data == 1.5, "the safe command")
 
 
+def test_a_controller_that_answers_samples_may_be_silent_between_them(rig: Rig) -> None:
+    """One that answers a slow sensor was taken for dead, and its commands replaced."""
+    commands = rig.listen("command", Float64, RELIABLE)
+    sensor = rig.node.create_publisher(Float64, "measurement", RELIABLE)
+    controller = rig.node.create_publisher(Float64, "controller_command", RELIABLE)
+    rig.relay(safe_command=0.5, controller_timeout=0.05)
+    rig.until(
+        lambda: sensor.get_subscription_count() and controller.get_subscription_count(),
+        "the relay",
+    )
+
+    def sample(*answer: Float64) -> float:
+        """Return the command after a sample and its answer; NaN: there was none yet."""
+        sensor.publish(Float64(data=5.0))
+        for command in answer:
+            controller.publish(command)
+        rig.run_for(0.2)
+        return commands[-1].data if commands else math.nan
+
+    sample()
+    sample()
+    for _ in range(10):
+        sample(Float64(data=0.7))
+    assert [m.data for m in commands] == [0.7] * 10
+    # It falls silent while the samples go on.
+    rig.until(lambda: sample() == 0.5, "the safe command")
+
+
 def test_gains_that_do_not_do_what_was_predicted_go_back(rig: Rig) -> None:
     """The published model has half the gain of the process."""
     commands = rig.listen("command", Float64, RELIABLE)
