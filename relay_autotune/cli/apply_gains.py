@@ -337,7 +337,3 @@ def found_entries(result: Any, noise_std: float = math.nan) -> list[tuple[str, s
         told = f"gain {gain} times the model's, Ms {ms} (predicted {predicted:.2f})"
         found.append(("process", told))
     return found
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -130,7 +129,3 @@ def topic_name(column: str) -> str:
     words = re.findall(r"[a-z0-9]+", bare)
     name = "_".join(words)
     return f"/{name}" if name[:1].isalpha() else f"/_{name}"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

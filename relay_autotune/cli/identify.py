@@ -359,7 +359,3 @@ def _run(options: argparse.Namespace) -> int:
     else:
         print("\n".join(identification_lines(found, width())))
     return DONE
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -284,7 +283,3 @@ def _as_they_come(jobs: Sequence[Job], options: argparse.Namespace) -> Iterator[
 def _tell(done: Done) -> None:
     for sentence in done.said:
         say(PROGRAM, sentence)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

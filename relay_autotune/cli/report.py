@@ -253,10 +253,6 @@ def _cases(job: Job) -> list[Case]:
             say(PROGRAM, sentence)
 
 
-if __name__ == "__main__":
-    sys.exit(main())
-
-
 _NEAR = 1e-6
 
 

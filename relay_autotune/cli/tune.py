@@ -559,7 +559,3 @@ def _told(found: _Designs, options: argparse.Namespace) -> int:
         say(PROGRAM, "no rule gives gains for this model")
         return NOTHING_FOUND
     return DONE
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -383,7 +383,3 @@ class Session:
             if signal.SIGHUP in came:
                 return NOTHING_FOUND
             raise
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -483,9 +483,12 @@ def test_a_constant_measurement_in_an_experiment_is_said(tmp_path, capsys):
     assert documents(out)[0]["experiments"][0]["models"] == []
 
 
+_REPLAY = "from relay_autotune.start import replay; raise SystemExit(replay())"
+
+
 def process(*arguments, **options):
     return subprocess.run(
-        [sys.executable, "-m", "relay_autotune.cli.replay", *map(str, arguments)],
+        [sys.executable, "-c", _REPLAY, *map(str, arguments)],
         cwd=REPOSITORY,
         capture_output=True,
         text=True,
@@ -529,9 +532,7 @@ def test_nothing_is_imported_that_a_bag_of_ours_does_not_need(tmp_path):
 
 def test_a_reader_that_leaves_early_gets_no_traceback(tmp_path):
     write_bag(tmp_path / "bag", tmp_path, relay_record())
-    command = (
-        f"{sys.executable} -m relay_autotune.cli.replay --structure fopdt {tmp_path}/bag | true"
-    )
+    command = f"{sys.executable} -c '{_REPLAY}' --structure fopdt {tmp_path}/bag | true"
     done = subprocess.run(
         ["bash", "-c", command], cwd=REPOSITORY, capture_output=True, text=True, timeout=120
     )
