@@ -170,7 +170,7 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
     :return: whether the gains are in force, and why their step failed; empty: it did not.
     """
     with Working("asking for the gains"):
-        present, model = client.in_force(), client.model()
+        present, (model, noise) = client.in_force(), client.identified()
         gains, doubt = client.waiting()
     if not options.verify_only:
         _require_trust(doubt, options)
@@ -203,7 +203,7 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
     new = None if options.verify_only else gains
     with noted(lambda text: say(PROGRAM, text)) as (shown, leave):
         result, entries = verified(
-            client, step, shown, leave, new,
+            client, step, shown, leave, new, noise,
             load=options.load, patience=options.wait, stays=options.stays,
         )  # fmt: skip
         shown.clear()
@@ -218,6 +218,7 @@ def verified(
     tell: Callable[[str], None],
     leave: Callable[[], bool],
     new: Controller | None,
+    noise: float,
     *,
     load: float = 0.0,
     patience: float = REST_WITHIN,
@@ -230,11 +231,12 @@ def verified(
     :param tell: called with what is waited for.
     :param leave: returns True to end the verification.
     :param new: the gains that wait, to be put in force; None: those in force are tried.
+    :param noise: in which the step is seen [y]; NaN: not known.
     :param load: a second step, of the load [u]; 0: none.
     :param patience: how long to wait until the loop is at rest [s].
     :param stays: True if the controller_node goes on running.
     """
-    before, noise = client.in_force(), client.noise()
+    before = client.in_force()
     result = client.prove(step, load, patience, tell, leave, new)
     try:
         now = client.in_force()

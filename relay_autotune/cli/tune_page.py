@@ -608,8 +608,9 @@ class GainsPage:
     def _verify(self, wish: PageCommand, controller: GainsClient, new: Controller | None) -> None:
         live = self.live
         self._begin_step("")
+        _, noise = controller.identified()
         result, entries = verified(
-            controller, wish.step, lambda text: live.tell(status=text), self.leave, new
+            controller, wish.step, lambda text: live.tell(status=text), self.leave, new, noise
         )
         live.show("proof", [_document(step) for step in controller.steps_of(result)])
         live.rest(

@@ -64,13 +64,9 @@ class GainsClient(LoopClient):
     def __init__(self, namespace: str, node: str, beside: LoopClient | None = None) -> None:
         super().__init__("apply_gains", namespace, node, beside=beside)
         self._verify = ActionClient(self._node, Verify, f"{node}/verify")
+        self._ends.callback(self._verify.destroy)
         self.left_behind = "; its set-point may still be moved"
         """What follows where the controller_node of another node's gains is lost in a proof."""
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._verify.destroy()
-        super().close()
 
     def find(self, patience: float, leave: Callable[[], bool] = lambda: False) -> None:
         """Wait for the controller_node.
@@ -122,23 +118,17 @@ class GainsClient(LoopClient):
             doubt = "they carry no verdict"
         return gains_from_message(found), doubt
 
-    def model(self) -> TransferFunction:
-        """Return the newest model of the loop.
+    def identified(self) -> tuple[TransferFunction, float]:
+        """Return the newest model of the loop, and the noise in which a step is seen [y].
+
+        That is the noise at rest or the residual; NaN: neither is known.
 
         :raises LoopError: if there is none.
         :raises RelayAutotuneError: if it cannot be.
         """
-        return transfer_function_from_message(self._result(ModelMessage, "transfer_function"))
-
-    def noise(self) -> float:
-        """Return the noise in which a step is seen, that at rest or the residual [y].
-
-        NaN: neither is known.
-
-        :raises LoopError: if there is no model.
-        """
-        message = self._result(ModelMessage, "transfer_function")
-        return noise_of(message.noise_std, message.residual_rms)
+        found = self._result(ModelMessage, "transfer_function")
+        noise = noise_of(found.noise_std, found.residual_rms)
+        return transfer_function_from_message(found), noise
 
     def _result(self, kind: Any, topic: str) -> Any:
         found = self.latched(kind, topic, lambda m: m.final, _RESULT_WITHIN)
@@ -399,10 +389,9 @@ class StepsHere:
         if found is None:
             return None
         low, high, least, most = client.values(client.name, LIMITS).values()
-        return StepChoice(
-            record_from_message(found), client.model(), Limits(low, high), Limits(least, most),
-            client.noise(),
-        )  # fmt: skip
+        limits = Limits(low, high), Limits(least, most)
+        model, noise = client.identified()
+        return StepChoice(record_from_message(found), model, *limits, noise)
 
     def usual(self) -> float | None:
         """Return the step of the node, else the one that proves most within its limits [y].

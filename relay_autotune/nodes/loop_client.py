@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any, Self
 
 import rclpy
@@ -97,9 +97,9 @@ class LoopClient:
         except (InvalidNamespaceException, InvalidTopicNameException) as error:
             text = str(error).splitlines()[0].rstrip(":")
             raise ParameterError(f"no node can be {namespace}/{node}: {text}") from None
-        self._is_guest = beside is not None
         self.why_lost: Callable[[], str] = beside.why_lost if beside else lambda: ""
         """Tells why it is no use to wait any longer; empty: it is."""
+        self._ends = ExitStack()
         if beside is None:
             self._context = Context()
             rclpy.init(
@@ -107,14 +107,19 @@ class LoopClient:
                 args=list(ros),
                 signal_handler_options=SignalHandlerOptions.NO,
             )
+            self._ends.callback(self._context.try_shutdown)
             self._executor = SingleThreadedExecutor(context=self._context)
         else:
             self._context, self._executor = beside._context, beside._executor
         if beside is None or namespace:
             self._node = Node(own, namespace=namespace or None, context=self._context)
             self._executor.add_node(self._node)
+            self._ends.callback(self._node.destroy_node)
+            self._ends.callback(self._executor.remove_node, self._node)
         else:
             self._node = beside._node
+        if beside is None:
+            self._ends.callback(self._executor.shutdown, timeout_sec=0.0)
         # That of the client which has the executor.
         self._first: Node = beside._first if beside else self._node
         self._joined = time.monotonic()
@@ -123,14 +128,7 @@ class LoopClient:
 
     def close(self) -> None:
         """Leave the graph."""
-        if self._is_guest:
-            if self._node is not self._first:
-                self._executor.remove_node(self._node)
-                self._node.destroy_node()
-            return
-        self._executor.shutdown(timeout_sec=0.0)
-        self._node.destroy_node()
-        self._context.try_shutdown()
+        self._ends.close()
 
     def __enter__(self) -> Self:
         return self

@@ -55,6 +55,7 @@ class TuneClient(LoopClient):
     ) -> None:
         super().__init__("tune_loop", namespace, node, ros, beside)
         self._client = ActionClient(self._node, Tune, f"{node}/tune")
+        self._ends.callback(self._client.destroy)
         self._alive = True
         self._node.create_subscription(
             GoalStatusArray,
@@ -78,11 +79,6 @@ class TuneClient(LoopClient):
         """What follows where relay_node is lost during a tune."""
         self.refused: set[str] = set()
         """Sentences on results that were received and refused."""
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._client.destroy()
-        super().close()
 
     def find(self, patience: float, *, needs_identifier: bool, leave: Callable[[], bool]) -> None:
         """Wait for the relay_node, and for the identifier_node if it is needed.

@@ -146,7 +146,7 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
 ) -> None:
     asked: list[str] = []
     client: Any = SimpleNamespace(
-        in_force=lambda: None, model=lambda: MODEL, noise=lambda: 0.01,
+        in_force=lambda: None, identified=lambda: (MODEL, 0.01),
         waiting=lambda: (GAINS, ""), has=lambda gains: False, ask=asked.append,
         steps=lambda: SimpleNamespace(
             usual=lambda: 3.0, expected=lambda gains, step: f"The command goes to {step:g} u.",
@@ -173,7 +173,7 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
 
 def client_of(prove: Any, in_force: Any) -> Any:
     return SimpleNamespace(
-        in_force=in_force, model=lambda: MODEL, noise=lambda: 0.01,
+        in_force=in_force, identified=lambda: (MODEL, 0.01),
         waiting=lambda: (GAINS, ""), has=lambda gains: in_force() is gains,
         steps=lambda: SimpleNamespace(
             allowed=lambda gains: StepRange(), expected=lambda gains, step: ""
