@@ -99,46 +99,38 @@ def for_bag(profile: QoSProfile) -> Qos:
     )
 
 
-def why_no_publisher(node: Node, topic: str, kind: str) -> str:
-    """Return why no measurement arrives on a topic, as far as the graph shows.
+def why_unconnected(node: Node, topic: str, kind: str, *, hears: bool) -> str:
+    """Return why nothing arrives from a topic, or on it, as far as the graph shows.
 
-    :param node: the node that subscribes.
-    :param topic: resolved name of the topic.
-    :param kind: the expected message type.
-    """
-    ends = node.get_publishers_info_by_topic(topic)
-    if not ends:
-        other = _other(node, topic, kind, "measurement", node.get_publishers_info_by_topic)
-        return f"{topic} has no publisher{other}"
-    own = _own(node, node.get_subscriptions_info_by_topic(topic))
-    why = _problems(ends, kind, lambda offered: qos_check_compatible(offered, own))
-    return f"{topic} has {_count(len(ends), 'publisher')}, but {why or 'nothing arrives'}"
-
-
-def why_no_subscriber(node: Node, topic: str, kind: str) -> str:
-    """Return why no node takes the command from a topic, as far as the graph shows.
-
-    :param node: the node that publishes.
+    :param node: the node that subscribes, or publishes.
     :param topic: resolved name of the topic.
     :param kind: the message type that is expected.
+    :param hears: True: the node is to hear a measurement; False: its command is to be heard.
     """
-    ends = node.get_subscriptions_info_by_topic(topic)
-    if not ends:
-        other = _other(node, topic, kind, "command", node.get_subscriptions_info_by_topic)
-        return f"{topic} has no subscriber{other}"
-    own = _own(node, node.get_publishers_info_by_topic(topic))
-    if why := _problems(ends, kind, lambda wanted: qos_check_compatible(own, wanted)):
-        return f"{topic} has no subscriber that can be served: {why}"
-    return f"{topic} has {_count(len(ends), 'subscriber')}, but none is connected yet"
-
-
-def _other(
-    node: Node, topic: str, kind: str, name: str, ends_of: Callable[[str], Sequence[Any]]
-) -> str:
-    """Return what to type for the topic that may be meant: that of this type with like names."""
-    first, more = nearest(node, topic, ends_of, kind)
-    typed = f"; {first} has one of this type: start the node with -r {name}:={first}{more}"
-    return typed if first else ""
+    what, name, none = "publisher", "measurement", "nothing arrives"
+    theirs, ours = node.get_publishers_info_by_topic, node.get_subscriptions_info_by_topic
+    if not hears:
+        what, name, none = "subscriber", "command", "none is connected yet"
+        theirs, ours = ours, theirs
+    if not (ends := theirs(topic)):
+        first, more = nearest(node, topic, theirs, kind)
+        typed = f"; {first} has one of this type: start the node with -r {name}:={first}{more}"
+        return f"{topic} has no {what}{typed if first else ''}"
+    # The profile in force; the requested one leaves deadlines to the middleware.
+    mine = node.get_fully_qualified_name()
+    own = next((end.qos_profile for end in ours(topic) if who(end) == mine), None)
+    problems = []
+    for end in ends:
+        if end.topic_type != kind:
+            problems.append(f"{who(end)} has type {end.topic_type}, expected {kind}")
+            continue
+        pair = (end.qos_profile, own) if hears else (own, end.qos_profile)
+        compatibility, reason = qos_check_compatible(*pair)
+        if compatibility == QoSCompatibility.ERROR:
+            mismatch = reason.replace("ERROR: ", "").rstrip("; ").replace(";", ", ")
+            problems.append(f"{who(end)} has an incompatible QoS: {mismatch}")
+    count = f"{len(ends)} {what}{'s' * (len(ends) > 1)}"
+    return f"{topic} has {count}, but {'; '.join(problems) or none}"
 
 
 def nearest(
@@ -186,31 +178,6 @@ def described(end: Any) -> str:
     """Return a publisher or subscription with its node, type and reliability."""
     best_effort = end.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
     return f"{who(end)} ({end.topic_type}, {'best effort' if best_effort else 'reliable'})"
-
-
-def _own(node: Node, ends: Sequence[Any]) -> Any:
-    # The profile in force; the requested one leaves deadlines to the middleware.
-    for end in ends:
-        if (end.node_namespace, end.node_name) == (node.get_namespace(), node.get_name()):
-            return end.qos_profile
-    return None
-
-
-def _problems(ends: Sequence[Any], kind: str, check: Any) -> str:
-    problems = []
-    for end in ends:
-        if end.topic_type != kind:
-            problems.append(f"{who(end)} has type {end.topic_type}, expected {kind}")
-            continue
-        compatibility, reason = check(end.qos_profile)
-        if compatibility == QoSCompatibility.ERROR:
-            mismatch = reason.replace("ERROR: ", "").rstrip("; ").replace(";", ", ")
-            problems.append(f"{who(end)} has an incompatible QoS: {mismatch}")
-    return "; ".join(problems)
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 # The lockstep protocol between plant_node and relay_node: the plant repeats its first measurement

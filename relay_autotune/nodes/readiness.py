@@ -29,7 +29,7 @@ from relay_autotune.experiment.relay_law import Levels, clear_swing, sought_swin
 from relay_autotune.nodes.goals import refused
 from relay_autotune.nodes.loop_ends import LoopSupervisor, RelayTopics
 from relay_autotune.nodes.parameters import merged, values_of
-from relay_autotune.nodes.quality import described, who, why_no_publisher, why_no_subscriber
+from relay_autotune.nodes.quality import described, who, why_unconnected
 from relay_autotune.nodes.shell import prefix
 from relay_autotune.nodes.tables import TUNE_PARAMETERS
 from relay_autotune.nodes.watch import LastSamples, Sensor, require_own_time
@@ -276,7 +276,9 @@ class Readiness:
         if dead := self._sensor.why_dead():
             raise NotReadyError(dead)
         if (age := self._sensor.age) > self._sensor.timeout:
-            why = why_no_publisher(node, ends.measurement.topic_name, ends.reader.type_name)
+            why = why_unconnected(
+                node, ends.measurement.topic_name, ends.reader.type_name, hears=True
+            )
             raise NotReadyError(
                 Code.NO_MEASUREMENT_YET(why=why)
                 if math.isinf(age)
@@ -299,7 +301,7 @@ class Readiness:
         messages, sent = self._ends.own.messages, self._ends.own.publisher
         own = sum(s.topic_name == sent.topic_name for s in self._node.subscriptions)
         if sent.get_subscription_count() <= own:
-            why = why_no_subscriber(self._node, sent.topic_name, messages.type_name)
+            why = why_unconnected(self._node, sent.topic_name, messages.type_name, hears=False)
             raise NotReadyError(Code.NO_SUBSCRIBER(why=why))
         if unknown := messages.why_unknown:
             raise NotReadyError(Code.OTHERS_NOT_THERE(why=unknown))

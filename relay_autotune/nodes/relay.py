@@ -26,7 +26,7 @@ from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.loop_ends import LoopSupervisor, RelayTopics
 from relay_autotune.nodes.parameters import ask_before_changes, declare, values_of
-from relay_autotune.nodes.quality import NO_REPEAT_AFTER, why_no_publisher
+from relay_autotune.nodes.quality import NO_REPEAT_AFTER, why_unconnected
 from relay_autotune.nodes.readiness import Checklist, Readiness, Ready, answer_of, require_settable
 from relay_autotune.nodes.recording import Recordings
 from relay_autotune.nodes.results import MODEL, OwnResults, said_by
@@ -419,7 +419,9 @@ class RelayNode(ServedNode):
         if self._sensor.misread:
             problems.append(str(self._sensor.misread))
         elif self._sensor.age > self._sensor.timeout:
-            why = why_no_publisher(self, self._ends.measurement.topic_name, self._reader.type_name)
+            why = why_unconnected(
+                self, self._ends.measurement.topic_name, self._reader.type_name, hears=True
+            )
             problems.append(f"no measurement comes: {why}")
         problems += filter(None, (self._recordings.problem(), self._loop.problem))
         idle = "passing" if self._loop.is_driven else "idle" if self._held is None else "holding"
