@@ -3,7 +3,7 @@
 
 """The steps of a tune that are the same on a terminal, at a joint and on a page: check it, run it.
 
-What a face shows of it is its own. :mod:`tuned` has what follows.
+What a face shows of it is its own. :mod:`after_tune` has what follows.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from relay_autotune.analysis import options_from
+from relay_autotune.cli.after_tune import Proof, Tuned
 from relay_autotune.cli.apply_gains import found_entries, verified
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say, worst
 from relay_autotune.cli.flow import checked, run
@@ -37,7 +38,6 @@ from relay_autotune.cli.tune_view import (
     estimate,
     oscillation,
 )
-from relay_autotune.cli.tuned import Proof, Tuned
 from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError, TuningError
 from relay_autotune.exchange.messages import (
     fill_gains,
