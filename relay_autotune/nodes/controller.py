@@ -490,9 +490,8 @@ class ControllerNode(ServedNode):
             self._remote.require_ready()
         new, settles = None, math.nan
         if request.apply:
-            name, gains = self._acceptable()
+            _, gains = self._acceptable()
             new, settles = self._place.set_of(gains), gains.settling_time
-            self._predictors.applied(new, name)
         kept = new or await self._place.read() or self._keeper.history.gains
         if kept is None or (self._remote is None and self._pid.is_manual):
             raise NotReadyError(Code.NOT_AUTOMATIC())

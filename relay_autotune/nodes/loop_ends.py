@@ -454,18 +454,18 @@ class LoopSupervisor:
         watch.again(self._timer, min(watch.LOOK_EVERY, left))
 
     def _silent_controller(self) -> Reason | None:
-        if not self._was_connected:
+        silent = self.handover.age
+        if not self._was_connected or silent <= self._controller_timeout:
             return None
         ends = self._ends
         topic = (ends.measurement if ends.is_reported else self._controller).topic_name
-        silent = partial(Code.SILENT_CONTROLLER, topic=topic)
-        return watch.silence(silent, self._controller_timeout, self.handover.age)
+        return Code.SILENT_CONTROLLER(topic=topic, silence=silent)
 
     def _silent_feedback(self) -> Reason | None:
-        if self._follow is None:
-            return None
         silent = time.monotonic() - self._feedback_at
-        return watch.silence(Code.SILENT_FEEDBACK, 2.0 * self._value("feedback_timeout"), silent)
+        if self._follow is None or silent <= 2.0 * self._value("feedback_timeout"):
+            return None
+        return Code.SILENT_FEEDBACK(silence=silent)
 
     def _on_controller(self, message: Float64) -> None:
         passed = self.handover.hear(message.data)

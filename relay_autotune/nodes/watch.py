@@ -521,16 +521,6 @@ def _publishers(node: Node, topic: str, but: str = "") -> str:
     return " and ".join(names) or "another node"
 
 
-def silence(reason: Callable[..., Reason], timeout: float, silent: float) -> Reason | None:
-    """Return a reason if a signal has been silent for too long.
-
-    :param reason: takes the silence.
-    :param timeout: longest silence [s].
-    :param silent: time since the last message [s].
-    """
-    return reason(silence=silent) if silent > timeout else None
-
-
 # The steady clock's time [s].
 now = time.monotonic
 

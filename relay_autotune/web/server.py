@@ -87,8 +87,6 @@ class Page:
         self.lives = tuple(lives)
         self.units: Mapping[str, str] = {}
         """What y and u stand for."""
-        self.computes_ahead = True
-        """Whether what the slider may ask for is computed while nothing is asked."""
         self._known: dict[tuple[int, DesignRequest], str] = {}
         self._last: dict[int, DesignRequest] = {}
         self._begun: Counter[tuple[int, DesignRequest]] = Counter()
@@ -122,7 +120,7 @@ class Page:
     def _next_ahead(self) -> Callable[[], object] | None:
         """Return what to compute ahead: what the slider can ask for next, once somebody asked."""
         # relay_node needs the processor while a tune runs.
-        if not self.computes_ahead or any(live.told.phase != "idle" for live in self.lives):
+        if any(live.told.phase != "idle" for live in self.lives):
             return None
         for number, last in list(self._last.items()):
             for asked in self.subjects[number].positions(last):
