@@ -386,36 +386,59 @@ def end_with_terminal() -> None:
     threading.Thread(target=watch, name="terminal", daemon=True).start()
 
 
+class Signals:
+    """The signals that end a work in order: they are only noted.
+
+    An exception could be lost in an import or in a callback of rclpy.
+    """
+
+    def __init__(self) -> None:
+        self.came: list[int] = []
+        """Those that have come."""
+        self._before: dict[int, Any] = {}
+
+    def note(self, *numbers: int) -> None:
+        """Only note these signals from now on."""
+        for number in numbers:
+            before = signal.signal(number, lambda n, _: self.came.append(n))
+            self._before.setdefault(number, before)
+
+    def obey(self) -> None:
+        """Let them do from now on what they did before."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before.clear()
+
+    def raise_if_came(self) -> None:
+        """Raise what the first signal that has come stands for."""
+        if self.came:
+            first = self.came[0]
+            raise KeyboardInterrupt if first == signal.SIGINT else SystemExit(128 + first)
+
+
 @contextmanager
 def noted(tell: Callable[[str], None]) -> Iterator[tuple[StatusLine, Callable[[], bool]]]:
     """Only note signals in the block, and obey them after it.
 
-    An exception could be lost in a callback of rclpy.
-
     :param tell: called with the error with which the block ends after a signal.
     :return: a line for the status, which ends with the block; what tells whether a signal came.
     """
-    came: list[int] = []
-    shown = StatusLine()
-    before = {
-        number: signal.signal(number, lambda n, _: came.append(n))
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        # An ignored SIGHUP stays ignored, for nohup.
-        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN
-    }
+    signals, shown = Signals(), StatusLine()
+    signals.note(signal.SIGINT, signal.SIGTERM)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        # An ignored one stays ignored, for nohup.
+        signals.note(signal.SIGHUP)
     try:
-        yield shown, lambda: bool(came)
+        yield shown, lambda: bool(signals.came)
     except RelayAutotuneError as error:
-        if not came:
+        if not signals.came:
             raise
         shown.clear()
         tell(str(error))
     finally:
         shown.clear()
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        if came:
-            raise KeyboardInterrupt if came[0] == signal.SIGINT else SystemExit(128 + came[0])
+        signals.obey()
+        signals.raise_if_came()
 
 
 def agreed_step(question: str, step: float, allowed: StepRange) -> float:

@@ -40,7 +40,15 @@ from relay_autotune.cli.arguments import (
 from relay_autotune.cli.flow import checked, run
 from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN, own_namespace
 from relay_autotune.cli.settings import FLAGS, Kind, add_settings, kind_of
-from relay_autotune.cli.terminal import GoBack, Help, Working, agrees, require_new, width
+from relay_autotune.cli.terminal import (
+    GoBack,
+    Help,
+    Signals,
+    Working,
+    agrees,
+    require_new,
+    width,
+)
 from relay_autotune.cli.tune_view import Shown, check_lines
 from relay_autotune.exchange.export import EXPORTS
 from relay_autotune.nodes.shell import prefix, typed_for_parameter
@@ -163,36 +171,6 @@ def _parser() -> argparse.ArgumentParser:
     add_settings(parser)
     add_web(parser, "serve a page on which tunes are started, watched and ended, until Ctrl-C")
     return parser
-
-
-class Signals:
-    """The signals that end a tune in order: they are only noted.
-
-    An exception could be lost in an import or in a callback of rclpy.
-    """
-
-    def __init__(self) -> None:
-        self.came: list[int] = []
-        """Those that have come."""
-        self._noted: set[int] = set()
-
-    def note(self, *numbers: int) -> None:
-        """Only note these signals from now on."""
-        for number in numbers:
-            signal.signal(number, lambda n, _: self.came.append(n))
-            self._noted.add(number)
-
-    def obey(self) -> None:
-        """Let a signal end the command at once from now on, and one that has come, now."""
-        for number in self._noted - {signal.SIGINT}:
-            signal.signal(number, signal.SIG_DFL)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        self._noted.clear()
-
-    def raise_if_came(self) -> None:
-        """Raise what a signal that has come stands for."""
-        if self.came:
-            raise KeyboardInterrupt
 
 
 @dataclass
