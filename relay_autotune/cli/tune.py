@@ -61,6 +61,7 @@ _FLAGS = (
     *("gain", "time_constants", "zeros", "dead_time", "integrators", "order", "structure"),
     *("natural_frequency", "damping", "numerator", "denominator"),
 )
+_NUMBERS_OF_MODEL = ("gain", "dead_time", "natural_frequency", "damping")
 
 
 def model_of(options: argparse.Namespace) -> TransferFunction:
@@ -95,28 +96,26 @@ def _built(given: dict[str, Any]) -> TransferFunction:
     A document has all of them, and its gain is that of the time-constant form. Flags, and
     objects that people write, have some, and their gain is that of the structure's formula.
     """
-    dead_time = _number("dead_time", given.get("dead_time", 0.0))
-    numerator, denominator = given.get("numerator"), given.get("denominator")
+    numbers: dict[str, Any] = {n: _number(n, given.get(n, 0.0)) for n in _NUMBERS_OF_MODEL}
+    gain, dead_time = numbers["gain"], numbers["dead_time"]
+    zeros, lags = (_constants(name, given.get(name)) for name in ("zeros", "time_constants"))
+    order, integrators = int(given.get("order") or 0), int(given.get("integrators") or 0)
+    numerator, denominator = (
+        _coefficients(name, given[name]) if given.get(name) is not None else None
+        for name in ("numerator", "denominator")
+    )
     structure = given.get("structure") or ""
     if structure and structure not in STRUCTURES:
         raise SelectionError(f"unknown structure {structure!r}; known: {', '.join(TABLE)}")
-    zeros, lags = (_constants(name, given.get(name)) for name in ("zeros", "time_constants"))
     if denominator is not None and "time_constants" in given and "gain" in given:
-        below = _coefficients("denominator", denominator)
-        integrators = len(below) - 1 - len(lags)
-        gain = _number("gain", given["gain"])
+        integrators = len(denominator) - 1 - len(lags)
         return TransferFunction(gain, zeros, lags, integrators, dead_time, structure or GENERAL)
     if numerator is not None or denominator is not None:
         if numerator is None or denominator is None:
             raise SelectionError("numerator and denominator belong together: give both")
-        return TransferFunction.from_polynomials(
-            _coefficients("numerator", numerator),
-            _coefficients("denominator", denominator),
-            dead_time,
-        )
+        return TransferFunction.from_polynomials(numerator, denominator, dead_time)
     if "gain" not in given:
         raise SelectionError("the model lacks its gain: give --gain")
-    gain = _number("gain", given["gain"])
     for lag in lags:
         if lag.real <= 0.0 and lag.imag == 0.0:
             raise SelectionError(
@@ -125,25 +124,9 @@ def _built(given: dict[str, Any]) -> TransferFunction:
             )
     if structure and structure != GENERAL:
         return structure_named(structure).of_fields(
-            gain=gain,
-            time_constants=_real("time_constants", lags),
+            **numbers, order=order, time_constants=_real("time_constants", lags),
             zeros=_real("zeros", zeros),
-            dead_time=dead_time,
-            order=int(given.get("order") or 0),
-            natural_frequency=_number("natural_frequency", given.get("natural_frequency", 0.0)),
-            damping=_number("damping", given.get("damping", 0.0)),
-        )
-    return _unnamed(given, gain, zeros, lags, dead_time)
-
-
-def _unnamed(
-    given: dict[str, Any],
-    gain: float,
-    zeros: tuple[complex, ...],
-    lags: tuple[complex, ...],
-    dead_time: float,
-) -> TransferFunction:
-    order, integrators = int(given.get("order") or 0), int(given.get("integrators") or 0)
+        )  # fmt: skip
     if order and len(lags) == 1:
         lags = lags * order
     elif order and order != len(lags):
@@ -152,13 +135,8 @@ def _unnamed(
             f"{len(lags)}"
         )
     if "natural_frequency" in given or "damping" in given:
-        pair = TransferFunction.oscillator(
-            1.0,
-            _number("natural_frequency", given.get("natural_frequency", 0.0)),
-            _number("damping", given.get("damping", 0.0)),
-            0.0,
-        )
-        lags = (*lags, *pair.time_constants)
+        pair = numbers["natural_frequency"], numbers["damping"]
+        lags = (*lags, *TransferFunction.oscillator(1.0, *pair, 0.0).time_constants)
     if not lags and not integrators:
         raise SelectionError("the model has no dynamics: give --time-constants or --integrators")
     return TransferFunction(gain, zeros, lags, integrators, dead_time)
