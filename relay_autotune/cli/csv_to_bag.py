@@ -89,15 +89,11 @@ def _convert(options: argparse.Namespace) -> int:
                 f"given with --measurement-topic and --command-topic"
             )
     epoch_ns = round(options.epoch * 1e9)
-    if not epoch_ns + int(measurement.time_ns[-1]) < 2**63:
-        raise SelectionError(
-            f"--epoch {options.epoch:g} s is after the year 2262, which no bag can hold; expected "
-            "seconds since 1970"
-        )
-    if epoch_ns + int(measurement.time_ns[0]) < 0:
+    first, last = (epoch_ns + int(measurement.time_ns[place]) for place in (0, -1))
+    if not 0 <= first <= last < 2**63:
         raise BagError(
             f"{options.csv} begins at {measurement.time_ns[0] / 1e9:g} s, but a bag has no time "
-            f"before 1970; give the date at which its time is zero with --epoch"
+            f"before 1970 or after 2262; give the date at which its time is zero with --epoch"
         )
     facts = {
         "source": options.csv.name,
@@ -107,7 +103,7 @@ def _convert(options: argparse.Namespace) -> int:
     with BagWriter(
         options.bag,
         [Topic(name) for name in topics],
-        start_ns=epoch_ns + int(measurement.time_ns[0]),
+        start_ns=first,
         custom=facts,
     ) as bag:
         rows = [

@@ -358,17 +358,16 @@ class ControllerNode(ServedNode):
     def _on_gains(self, message: Any) -> None:
         if not message.final:
             return
-        gains = self._results.gains(message)
-        if gains is None:
-            self._refused = self._results.refusals.last
-            return
-        name = message.experiment_id
+        name, gains = message.experiment_id, self._results.gains(message)
         try:
-            self._place.require_law(gains)
-            self._settings.bounds.require(gains)
-            self._keeper.history.require_not_failed(self._place.set_of(gains))
+            if gains is not None:
+                self._place.require_law(gains)
+                self._settings.bounds.require(gains)
+                self._keeper.history.require_not_failed(self._place.set_of(gains))
         except RelayAutotuneError as error:
             self._results.refusals.say("gains", name, error)
+            gains = None
+        if gains is None:
             self._refused = self._results.refusals.last
             return
         self._pending, self._refused = (name, gains), ""
