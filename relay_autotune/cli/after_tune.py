@@ -32,8 +32,6 @@ from relay_autotune.cli.loops import PATIENCE, Loop, Steps
 from relay_autotune.cli.own_nodes import (
     PROGRAM,
     START_WITHIN,
-    own_namespace,
-    own_node,
     ranges,
     ros_arguments,
 )
@@ -236,7 +234,7 @@ class Proof:
         # The journal of proven and failed gains is that of this controller_node alone.
         with (
             tempfile.TemporaryDirectory() as journal,
-            GainsClient("", own_node(options, CONTROLLER), beside=client) as found,
+            GainsClient("", f"{loop.space}/{CONTROLLER}", beside=client) as found,
         ):
             values = {
                 "initial_setpoint": rest.setpoint,
@@ -252,7 +250,7 @@ class Proof:
             if self.rate is not None:
                 values |= parameters_of_law(self.rate.law.name, self.rate.period)
             topics = {"measurement": options.measurement}
-            arguments = ros_arguments(own_namespace(options), topics, values)
+            arguments = ros_arguments(loop.space, topics, values)
             loop.nodes.start(CONTROLLER, arguments)
             try:
                 yield found

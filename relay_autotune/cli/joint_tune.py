@@ -22,8 +22,6 @@ from relay_autotune.cli.own_nodes import (
     PROGRAM,
     START_WITHIN,
     namespace_of_joint,
-    own_namespace,
-    own_node,
     ranges,
     ros_arguments,
 )
@@ -62,7 +60,7 @@ class JointLoop(Loop):
     """A joint that is to be tuned.
 
     :param robot: a node of the graph; it goes on where a node of this command is lost.
-    :param options: of the command line; the namespace of the nodes is set in it.
+    :param options: of the command line.
     :param client: returns the client of the relay_node that will be started in a namespace.
     :raises LoopError: if the loop is not there, or something is not known and nobody can be asked.
     """
@@ -93,8 +91,6 @@ class JointLoop(Loop):
                 )
                 self._former = in_the_way(loaded, self._forward.needs)
                 self._held = self._commands_beside(self._forward)
-        options.namespace = namespace_of_joint(loop.node, loop.joint)
-        self._space = own_namespace(options)
         if loop.why_not_moved and not options.open:
             raise LoopError(f"{loop.controller} stays as it is: {self._why_not_closed()}")
         if not options.open and not math.isfinite(loop.state.reference):
@@ -102,7 +98,7 @@ class JointLoop(Loop):
                 f"{loop.controller} has no reference for {loop.joint} yet: publish one on "
                 f"{loop.reference_topic}, and wait until the joint rests there"
             )
-        super().__init__(client(self._space, robot), options)
+        super().__init__(client(namespace_of_joint(loop.node, loop.joint), robot), options)
         self.client.left_behind = self.left_behind
         self._take_known()
         if not options.web:
@@ -303,10 +299,10 @@ class JointLoop(Loop):
         loop, options = self._loop, self.options
         topics, values = self._opened_ends() if options.open else self._closed_ends()
         values |= self.parameters((*self.form, "measurement_timeout"))
-        nodes = {"relay_node": ros_arguments(self._space, topics, values)}
+        nodes = {"relay_node": ros_arguments(self.space, topics, values)}
         if not options.record_only:
             design = {"law": loop.law, "sample_period": loop.period}
-            nodes["identifier_node"] = ros_arguments(self._space, {}, design)
+            nodes["identifier_node"] = ros_arguments(self.space, {}, design)
         return nodes
 
     def _closed_ends(self) -> tuple[dict[str, str], dict[str, Any]]:
@@ -558,7 +554,7 @@ class JointLoop(Loop):
         self.client.why_lost = lambda: self.nodes.why_lost() or why_inactive()
         try:
             return apply_at(
-                own_node(self.options, "controller_node"),
+                f"{self.space}/controller_node",
                 self.client,
                 doubtful=bool(doubt),
                 yes=self.options.yes,
@@ -586,7 +582,7 @@ class JointLoop(Loop):
         for name, clamp in zip(("command_min", "command_max"), loop.clamps, strict=True):
             if math.isfinite(clamp):
                 values[name] = clamp
-        self.nodes.start("controller_node", ros_arguments(self._space, topics, values))
+        self.nodes.start("controller_node", ros_arguments(self.space, topics, values))
 
     def after_tune(self) -> None:
         """Let a page show, change and verify the gains of the joint's controller."""

@@ -12,16 +12,18 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import signal
 import sys
+import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.bag.field_path import first_numbers, unit_of_field
-from relay_autotune.cli.own_nodes import OwnNodes, own_namespace, ros_arguments
+from relay_autotune.cli.own_nodes import OwnNodes, ros_arguments
 from relay_autotune.cli.settings import FLAGS, SETTING, Answers, Question, as_flags
 from relay_autotune.cli.terminal import UNITS, Working, asked, broken, width
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
@@ -41,10 +43,25 @@ if TYPE_CHECKING:
 Steps = list[tuple[str, str]]
 # Told the state of a tune, tells why it has to end; empty: it goes on.
 WhyOver = Callable[[int], str]
+# Time between two looks at a tune, and two updates of a terminal [s].
+_TICK = 0.25
 # How long to wait for what a node still has to answer, and at most while a page waits [s].
 PATIENCE, _ANSWERS = 5.0, 1.0
 # How long present commands are listened to [s].
 _LISTEN = 1.0
+
+
+class Face(Protocol):
+    """Where a tune is shown."""
+
+    def take(self, feedback: Any) -> None:
+        """Show a `Tune.Feedback`."""
+
+    def tick(self) -> None:
+        """Show that time passes."""
+
+    def say(self, text: str) -> None:
+        """Write a line that stays."""
 
 
 class Loop:
@@ -70,6 +87,11 @@ class Loop:
     def title(self) -> str:
         """The name of the loop for people."""
         return self.client.name
+
+    @property
+    def space(self) -> str:
+        """The namespace of its nodes."""
+        return self.client.name.rpartition("/")[0]
 
     def set(self, changed: dict[str, Any]) -> None:
         """Take other values of the settings of `form`.
@@ -156,6 +178,62 @@ class Loop:
     def opened(self) -> Iterator[WhyOver]:
         """Open the loop for a tune, if its kind needs that."""
         yield lambda _: self.nodes.why_lost("identifier_node")
+
+    def check(self, deadline: float = 0.0) -> Any:
+        """Ask whether a tune could start; return the answer, a `Tune.Result`.
+
+        :param deadline: until when its nodes may not know yet what they need.
+        """
+        client, options = self.client, self.options
+        # Right after its start a node of the command does not know all of these yet.
+        awaited = {Code.REST_UNKNOWN, *[Code.NO_IDENTIFIER] * (not options.record_only)}
+        while True:
+            found = client.check(options.amplitude)
+            lacking = self.has_own_nodes and any(why.code in awaited for why in found.refusals)
+            if not (client.not_ready_yet or lacking) or time.monotonic() > deadline:
+                return found
+            time.sleep(_TICK)
+
+    def tune(
+        self, face: Face, interrupted: list[int], deadline: float = 0.0, tick: float = _TICK
+    ) -> None:
+        """Ask for a tune, and show it until its result is there; cancel it when asked to.
+
+        :param face: where it is shown.
+        :param interrupted: signals that have come.
+        :param deadline: until when its nodes may not be ready; 0: they are asked once.
+        :param tick: interval of the looks [s].
+        """
+        client = self.client
+        with self.opened() as why_over:
+            while True:
+                client.ask(self.options.amplitude, dry_run=False)
+                self._follow(face, interrupted, why_over, tick)
+                if interrupted or not client.not_ready_yet or time.monotonic() > deadline:
+                    return
+                time.sleep(_TICK)
+
+    def _follow(self, face: Face, interrupted: list[int], why_over: WhyOver, tick: float) -> None:
+        client, cancelled, state = self.client, False, 0
+        while not client.done():
+            client.spin(tick)
+            for feedback in client.news():
+                face.take(feedback)
+                state = feedback.state
+            face.tick()
+            over = why_over(state)
+            if (interrupted or over) and not cancelled:
+                cancelled = True
+                client.cancel()
+                if over:
+                    face.say(over)
+                face.say("cancelling: the safe command goes out, then the recording is closed")
+            elif any(number != signal.SIGHUP for number in interrupted[1:]):
+                # SIGHUP does not count: a shell that ends with its terminal sends it once more.
+                raise LoopError(
+                    f"stopped waiting; {client.name} still sends the safe command, and its log "
+                    f"says how the tune ended"
+                )
 
     def left(self) -> str:
         """Return in which state a tune without gains has left the plant; empty: not known."""
@@ -307,7 +385,7 @@ class TopicLoop(Loop):
 
     def arguments(self) -> dict[str, list[str]]:
         """Return the arguments for ROS of its nodes, by the names of their executables."""
-        options, space = self.options, own_namespace(self.options)
+        options, space = self.options, self.space
         values: dict[str, Any] = {
             "measurement_type": self._kind,
             "command_type": self._command_kind,

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import fcntl
 import os
@@ -37,11 +36,6 @@ _PR_SET_PDEATHSIG = 1
 _PREFIX = re.compile(r"\[[A-Z]+\] \[[0-9.]+\] \[\S+\]: |\w+_node: ")
 
 
-def own_namespace(options: argparse.Namespace) -> str:
-    """Return the namespace of the nodes: that of the flag, else one of this process alone."""
-    return str(options.namespace or f"tune_loop_{os.getpid()}")
-
-
 def namespace_of_joint(controller: str, joint: str) -> str:
     """Return the namespace of the nodes that tune a joint, which no other joint has.
 
@@ -59,14 +53,6 @@ def namespace_of_joint(controller: str, joint: str) -> str:
         f"_{joint}",
     )
     return f"{controller}/tune{escaped}"
-
-
-def own_node(options: argparse.Namespace, name: str) -> str:
-    """Return the full name of a node of this command.
-
-    :param name: its name in their namespace.
-    """
-    return f"/{own_namespace(options).strip('/')}/{name}"
 
 
 def ros_arguments(

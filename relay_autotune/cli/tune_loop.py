@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shlex
 import signal
 import sys
@@ -37,8 +38,7 @@ from relay_autotune.cli.arguments import (
     guarded_in_graph,
     say,
 )
-from relay_autotune.cli.flow import checked, run
-from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN, own_namespace
+from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN
 from relay_autotune.cli.settings import FLAGS, Kind, add_settings, kind_of
 from relay_autotune.cli.terminal import (
     GoBack,
@@ -257,12 +257,14 @@ class Session:
         def client(space: str, robot: LoopClient | None = None) -> TuneClient:
             return self._joined(TuneClient, space, options.node, ros, robot)
 
+        # The nodes of this process alone have a namespace of their own.
+        own = options.namespace or f"tune_loop_{os.getpid()}"
         if kind is Kind.TOPICS:
-            return [TopicLoop(client(own_namespace(options)), options)]
+            return [TopicLoop(client(own), options)]
         if kind in (Kind.JOINT, Kind.OPENED):
             from relay_autotune.cli.joint_tune import JointLoop
 
-            robot = self._joined(LoopClient, own_namespace(options), "", options.node, ros)
+            robot = self._joined(LoopClient, own, "", options.node, ros)
             return [JointLoop(robot, options, client)]
         spaces = options.namespace.split(",") if options.web else [options.namespace]
         # The loops of a page have settings of their own.
@@ -295,7 +297,7 @@ class Session:
         options, may_go_back = self.options, loop.answers.may_go_back
         while True:
             with Working("looking at the loop"):
-                found = checked(loop, deadline)
+                found = loop.check(deadline)
             if not self._may_start(loop, found):
                 return False
             if options.dry_run:
@@ -334,7 +336,7 @@ class Session:
         # Signals must work even while writing to standard error would block.
         wait_again = never_wait_for(sys.stderr.fileno())
         try:
-            run(loop, shown, signals.came, deadline)
+            loop.tune(shown, signals.came, deadline)
             shown.clear()
         finally:
             wait_again()

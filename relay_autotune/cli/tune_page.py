@@ -25,7 +25,6 @@ from relay_autotune.analysis import options_from
 from relay_autotune.cli.after_tune import Proof, Tuned
 from relay_autotune.cli.apply_gains import found_entries, verified
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say, worst
-from relay_autotune.cli.flow import checked, run
 from relay_autotune.cli.loops import Loop
 from relay_autotune.cli.own_nodes import PROGRAM
 from relay_autotune.cli.report import analysed_as_there, flags_of
@@ -229,7 +228,7 @@ class _LoopOnPage:
     def _check(self) -> None:
         """Ask whether a tune could start, and how."""
         self._live.tell(phase="checking", status="looking at the loop", tone="")
-        result = checked(self._loop, 0.0)
+        result = self._loop.check()
         accepted = self._client.succeeded
         self._live.forget_wishes()
         self._live.rest(
@@ -256,7 +255,7 @@ class _LoopOnPage:
         with ExitStack() as stack:
             # Only once it has begun: see TuneClient.command_watch.
             self._at_first = lambda: stack.enter_context(self._commands_shown())
-            run(self._loop, self, self._ends, tick=_TICK)
+            self._loop.tune(self, self._ends, tick=_TICK)
             self._terminal.clear()
         if not live.told.window[1]:
             live.tell(window=(live.told.window[0], live.now))

@@ -174,6 +174,7 @@ class Looker:
     """A client of a loop whose topics have these types, with a present command."""
 
     takes = "std_msgs/msg/Float64"
+    name = "/tank/relay_node"
 
     def __init__(
         self,

@@ -491,7 +491,7 @@ def test_an_opened_joint_without_limits_of_the_command_is_tuned_without_them() -
     )  # fmt: skip
     tune = SimpleNamespace(
         _loop=loop, options=options, answers=Answers(options), _manager=arm, _held=[math.nan],
-        _robot=SimpleNamespace(kind_of=lambda *_, **__: ""), _space="tune",
+        _robot=SimpleNamespace(kind_of=lambda *_, **__: ""), space="/tune",
         form=Loop.form,
         _forward=SimpleNamespace(name="forward", needs=(loop.interface,)),
     )  # fmt: skip
@@ -547,7 +547,7 @@ def test_a_proof_that_is_lost_tells_how_its_joint_is_left(monkeypatch, off, take
         reference_topic="/pid/reference",
     )  # fmt: skip
     tune = SimpleNamespace(
-        _loop=loop, _manager=manager, _at_controller=lambda: ({}, {}), _space="/tune",
+        _loop=loop, _manager=manager, _at_controller=lambda: ({}, {}), space="/tune",
         client=SimpleNamespace(),
         _start_controller=lambda: JointLoop._start_controller(tune),
         options=SimpleNamespace(keep_gains=False, yes=True, namespace="tune"),
