@@ -11,6 +11,7 @@ import math
 import shlex
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from typing import Any
 
 import yaml
@@ -25,7 +26,7 @@ from relay_autotune.cli.own_nodes import (
     ranges,
     ros_arguments,
 )
-from relay_autotune.cli.settings import Question
+from relay_autotune.cli.settings import SETTING, Setting
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import Working, agrees, tell, width
 from relay_autotune.errors import LoopError, SelectionError
@@ -120,19 +121,19 @@ class JointLoop(Loop):
         if answers["command_within"] is None and all(map(math.isfinite, found)):
             answers.take({"command_within": found}, "its limits")
 
-    def _questions(self) -> list[Question]:
+    def _questions(self) -> list[Setting]:
         """Return what is asked for where it is not known."""
         loop = self._loop
         of = f"{loop.commanded} of {loop.joint}"
-        wanted = [
-            Question("within", f"lowest and highest {loop.measured} that {loop.joint} may have",
-                     "-5 5"),
-        ]  # fmt: skip
+        may = f"lowest and highest {loop.measured} that {loop.joint} may have"
+        wanted = [replace(SETTING["within"], question=may, example="-5 5")]
         if self.options.open:
-            wanted.append(Question("at", f"present {of}, at which it rests", "0"))
+            at = f"present {of}, at which it rests"
+            wanted.append(replace(SETTING["at"], question=at, example="0"))
             # The amplitude is found by them.
             if not self.options.amplitude:
-                wanted.append(Question("command_within", f"lowest and highest {of}", "-2 2"))
+                ends = f"lowest and highest {of}"
+                wanted.append(replace(SETTING["command_within"], question=ends, example="-2 2"))
         return wanted
 
     @property

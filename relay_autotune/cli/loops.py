@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.bag.field_path import first_numbers, unit_of_field
 from relay_autotune.cli.own_nodes import OwnNodes, ros_arguments
-from relay_autotune.cli.settings import FLAGS, SETTING, Answers, Question, as_flags
+from relay_autotune.cli.settings import FLAGS, SETTING, Answers, as_flags
 from relay_autotune.cli.terminal import UNITS, Working, asked, broken, width
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
 from relay_autotune.exchange.export import Target
@@ -325,7 +325,7 @@ class TopicLoop(Loop):
         if not options.web:
             # The amplitude is found between the limits of the command.
             known = options.amplitude and options.command_within is None
-            answers.ask(*map(Question, self.form[: 2 if known else 3]))
+            answers.ask(*(SETTING[name] for name in self.form[: 2 if known else 3]))
 
     def _reader(self) -> Reader:
         """Return what reads the measurement; ask where the messages do not have that of --field.

@@ -207,20 +207,6 @@ def as_flags(text: str) -> str:
     return text
 
 
-@dataclass(frozen=True)
-class Question:
-    """What is asked for.
-
-    :param name: of the setting.
-    :param what: how it is asked for; empty: as its row says.
-    :param example: what may be typed; empty: as its row says.
-    """
-
-    name: str
-    what: str = ""
-    example: str = ""
-
-
 @dataclass
 class Answers:
     """What is known of a loop, where it comes from, and what is asked for.
@@ -232,7 +218,7 @@ class Answers:
     options: argparse.Namespace
     measured: float = math.nan
     _from: dict[str, str] = field(default_factory=dict)
-    _asked: list[Question] = field(default_factory=list)
+    _asked: list[Setting] = field(default_factory=list)
 
     def __getitem__(self, name: str) -> Any:
         """Return the value of a setting; None: it is not known."""
@@ -312,12 +298,12 @@ class Answers:
             if len(found) == each.ends and all(map(math.isfinite, found)):
                 setattr(self.options, each.name, found if each.ends > 1 else found[0])
 
-    def ask(self, *questions: Question) -> None:
+    def ask(self, *questions: Setting) -> None:
         """Ask for what is not known yet, and refuse what cannot be; `<` goes back to the last one.
 
         What is given is looked at before anything is asked for.
 
-        :param questions: in their order.
+        :param questions: the settings in their order.
         :raises SelectionError: if what is given cannot be.
         :raises LoopError: if nobody can be asked.
         """
@@ -353,9 +339,8 @@ class Answers:
             except GoBack:
                 place -= 1
 
-    def _ask(self, question: Question, *, back: bool) -> None:
-        name, example = question.name, question.example
-        setting, seen = SETTING[name], self.now(name)
+    def _ask(self, setting: Setting, *, back: bool) -> None:
+        name, example, seen = setting.name, setting.example, self.now(setting.name)
         if setting.ends > 1 and seen:
             example = "{:g} {:g}".format(*_around(self._seen(name)))
 
@@ -365,8 +350,8 @@ class Answers:
             return setting.read(text)
 
         value = asked(
-            f"{question.what or setting.question} [{setting.unit}]" + f", {seen}" * bool(seen),
-            flag_of(setting), "", example or setting.example, read,
+            f"{setting.question} [{setting.unit}]" + f", {seen}" * bool(seen),
+            flag_of(setting), "", example, read,
             lambda found: self.why_impossible(name, found), pair=setting.ends > 1, back=back,
         )  # fmt: skip
         self.take({name: value}, "typed")
