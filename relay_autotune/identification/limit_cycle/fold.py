@@ -35,7 +35,8 @@ from relay_autotune.record.record import Record, RelaySettings, cached_on_record
 from relay_autotune.scalar import minimum_near
 
 _RIDGE = 1e-13
-_TOLERANCE = 1e-7
+# Of the phase of a kink, for each function with one.
+_TOLERANCE = 2.5e-8
 
 
 class Spline:
@@ -45,18 +46,18 @@ class Spline:
     little more than they do.
 
     :param basis: the functions.
-    :param knots: number of the spline's knots.
+    :param count: number of the spline's functions.
     :param x: phases, shape (n,).
     :param y: shape (n,).
     :param weight: number of samples that each point stands for, shape (n,).
     """
 
     def __init__(
-        self, basis: Basis, knots: int, x: FloatArray, y: FloatArray, weight: FloatArray
+        self, basis: Basis, count: int, x: FloatArray, y: FloatArray, weight: FloatArray
     ) -> None:
-        self._basis, self._knots, self._x = basis, knots, x
+        self._basis, self._count, self._x = basis, count, x
         self._root = np.sqrt(weight)[:, None]
-        columns = basis.spline(x, knots, 0)
+        columns = basis.spline(x, count, 0)
         if basis.mirrored:
             columns = np.column_stack((columns, np.ones(x.size)))
         # Only four or five of the functions are not zero at a point.
@@ -85,7 +86,7 @@ class Spline:
             return self._smooth, float(self._left @ self._left)
         cost, part, along = self._kinked(edge)
         rest = self._smooth - along @ part
-        return np.concatenate((rest[: self._knots], part, rest[self._knots :])), cost
+        return np.concatenate((rest[: self._count], part, rest[self._count :])), cost
 
     def _kinked(self, edge: float) -> tuple[float, FloatArray, FloatArray]:
         columns = self._basis.edges(self._x, edge, 0) * self._root
@@ -109,7 +110,9 @@ class Spline:
         :param places: increasing phases, shape (m,).
         """
         i = int(np.argmin(np.abs(places - near)))
-        return minimum_near(lambda p: self._kinked(p)[0], places, i, _TOLERANCE)[0]
+        return minimum_near(
+            lambda p: self._kinked(p)[0], places, i, _TOLERANCE * self._basis.kinks
+        )[0]
 
 
 def _with_slopes(*rows: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
@@ -124,15 +127,14 @@ _PIECES = _with_slopes(
     *((1 / 6, -0.5, 0.5, -1 / 6), (2 / 3, 0.0, -1.0, 0.5), (1 / 6, 0.5, 0.5, -0.5)),
     (0.0, 0.0, 0.0, 1 / 6),
 )
-_WAVES = _with_slopes((1.0, -2.0, 0.0), (0.0, 1.0, -1.0))
 _BERNOULLI = _with_slopes((0.0, 1.0, -1.0, 0.0), (0.0, 1.0, -3.0, 2.0))
 
 
 @dataclass(frozen=True)
 class Basis:
-    """Functions that repeat with period 1, or mirrored: that change their sign after 1.
+    """Functions of the phase that repeat with period 1.
 
-    :param mirrored: True: each half is the other one upside down.
+    :param mirrored: True: their second half is the first one upside down.
     :param high: phase of the switch to low.
     """
 
@@ -144,37 +146,32 @@ class Basis:
         """Number of functions with a kink."""
         return 2 if self.mirrored else 4
 
-    def spline(self, phase: FloatArray, knots: int, derivative: int) -> FloatArray:
-        """Return the cubic B-splines on even knots, or their rates, shape (n, knots)."""
-        turn = np.floor(phase)
-        place = (phase - turn) * knots
+    def spline(self, phase: FloatArray, count: int, derivative: int) -> FloatArray:
+        """Return cubic B-splines on even knots, or their rates, shape (n, count)."""
+        knots = count * (2 if self.mirrored else 1)
+        place = (phase % 1.0) * knots
         cell = np.minimum(np.floor(place).astype(np.int64), knots - 1)
-        s = place - cell
-        pieces = float(knots) ** derivative * polyval(s, _PIECES[derivative])
-        columns = np.zeros((phase.size, knots))
-        rows = np.arange(phase.size)
+        columns, rows = np.zeros((phase.size, knots)), np.arange(phase.size)
+        pieces = float(knots) ** derivative * polyval(place - cell, _PIECES[derivative])
         for k, piece in enumerate(pieces):
-            wrapped = cell + k >= knots
-            sign = np.where(wrapped != (turn % 2.0 == 1.0), -1.0, 1.0) if self.mirrored else 1.0
-            columns[rows, (cell + k) % knots] += sign * piece
-        return columns
+            columns[rows, (cell + k) % knots] += piece
+        return columns[:, :count] - columns[:, count:] if self.mirrored else columns
 
     def edges(self, phase: FloatArray, edge: float, derivative: int) -> FloatArray:
         """Return functions whose first or second derivative jumps, shape (n, kinks).
 
-        Repeating: Bernoulli's polynomials of second and third degree, at ``edge`` and at
-        ``high + edge``. Mirrored: a triangular wave and one of parabolas, at ``edge``.
+        They are Bernoulli's polynomials of second and third degree, at ``edge`` and at
+        ``high + edge``.
         """
-        columns = []
-        for place in (edge,) if self.mirrored else (edge, self.high + edge):
-            turn = np.floor(phase - place)
-            sign = np.where(turn % 2.0 == 1.0, -1.0, 1.0) if self.mirrored else 1.0
-            pair = (_WAVES if self.mirrored else _BERNOULLI)[derivative]
-            columns.append(sign * polyval(phase - place - turn, pair))
-        return np.concatenate(columns).T
+        pair = _BERNOULLI[derivative]
+        first, second = (
+            polyval((phase - place) % 1.0, pair).T for place in (edge, self.high + edge)
+        )
+        return first - second if self.mirrored else np.hstack((first, second))
 
 
-# Numbers of knots in half a period, from the fewest on, and least number of samples for each.
+# Numbers of knots in half a period, from the fewest on, and least number of samples for each
+# function.
 _KNOTS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 _SAMPLES_PER_KNOT = 3.0
 _MOST_POINTS = 1200
@@ -224,7 +221,7 @@ class Fold:
         return self.period_high + self.period_low
 
     @property
-    def knots(self) -> int:
+    def count(self) -> int:
         """Number of the spline's functions."""
         kinks = 0 if math.isnan(self.edge) else Basis(self.mirrored, 0.0).kinks
         return self.coefficients.size - kinks - self.mirrored
@@ -307,13 +304,13 @@ class Fold:
         return 0.5 * (at_high + at_low), 0.5 * (at_low - at_high) * side
 
     def _value(self, time: FloatArray, derivative: int) -> FloatArray:
-        unit = self.period_high if self.mirrored else self.period
+        unit = self.period
         columns = Basis(self.mirrored, self.period_high / unit)
-        knots = self.knots
-        y = columns.spline(time / unit, knots, derivative) @ self.coefficients[:knots]
+        count = self.count
+        y = columns.spline(time / unit, count, derivative) @ self.coefficients[:count]
         if not math.isnan(self.edge):
             part = columns.edges(time / unit, self.edge / unit, derivative)
-            y = y + part @ self.coefficients[knots : knots + columns.kinks]
+            y = y + part @ self.coefficients[count : count + columns.kinks]
         if self.mirrored and derivative == 0:
             y = y + self.coefficients[-1]
         return np.asarray(y / unit if derivative else y)
@@ -516,7 +513,7 @@ def _smoothed(
             f"the steady cycles hold {y.size} samples; their shape needs at least "
             f"{_SAMPLES_PER_KNOT * 2 * _KNOTS[0]:g}: sample faster, or let the relay run longer"
         )
-    unit = high if mirrored else high + low
+    unit = high + low
     x, value, weight = _binned(time / unit, y)
     n = x.size
     basis = Basis(mirrored, high / unit)
@@ -532,17 +529,17 @@ def _smoothed(
         )
 
     if like is not None:
-        spline, edge = Spline(basis, like.knots, x, value, weight), like.edge / unit
+        spline, edge = Spline(basis, like.count, x, value, weight), like.edge / unit
         return smoothed(spline, edge if math.isnan(edge) else spline.refined(edge, places))
     floor = n * (_NEGLIGIBLE * float(np.ptp(y))) ** 2 or 1e-300
     best: tuple[Spline, float] | None = None
     least, worse, edge = math.inf, 0, math.nan
     for half in _KNOTS:
-        knots = half if mirrored else 2 * half
-        if best is not None and (n < _SAMPLES_PER_KNOT * knots or worse > _PATIENCE):
+        count = half if mirrored else 2 * half
+        if best is not None and (n < _SAMPLES_PER_KNOT * count or worse > _PATIENCE):
             break
         worse += 1
-        spline = Spline(basis, knots, x, value, weight)
+        spline = Spline(basis, count, x, value, weight)
         if half <= _SEARCHED:
             edge = spline.searched(places)
         edge = spline.refined(edge, places)
