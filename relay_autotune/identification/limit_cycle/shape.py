@@ -19,7 +19,6 @@ from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import fdtrc
 
 from relay_autotune.arrays import FloatArray
@@ -28,7 +27,7 @@ from relay_autotune.identification.limit_cycle.fold import Fold, Reading, fold
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.record.cycles import cycles_of, settings_of
 from relay_autotune.record.record import Record, cached_on_record
-from relay_autotune.scalar import minimum_near, roots
+from relay_autotune.scalar import minimum_near, root, roots
 
 _LEAST_PEAKS = 6
 _QUICKEST = 0.1
@@ -247,7 +246,7 @@ def relative_amplitude(time_to_peak: float, half_period: float, level: float) ->
 
     if not (abs(level) < 1.0 and excess(-_NEARLY_ONE) <= 0.0 <= excess(_NEARLY_ONE)):
         return math.nan
-    return float(brentq(excess, -_NEARLY_ONE, _NEARLY_ONE, xtol=1e-16, rtol=1e-15))
+    return root(excess, -_NEARLY_ONE, _NEARLY_ONE, 1e-16)
 
 
 def _widened(shape: Shape) -> float:
@@ -290,7 +289,9 @@ def shape_of_curve(
             "the measurement does not pass the set-point between two switches: this is no limit "
             "cycle of a relay, or its hysteresis is not the one given"
         )
-    peak = _turning_point(y, float(grid[max(top - 1, 0)]), float(grid[min(top + 1, _GRID - 1)]))
+    ends = float(grid[max(top - 1, 0)]), float(grid[min(top + 1, _GRID - 1)])
+    # The rate changes its sign there, smoothly or at an edge.
+    peak = root(lambda t: float(y.slope(np.array([t]))[0]), *ends, 1e-15 * (ends[1] - ends[0]))
     a = max(_at(y, peak), float(values[top]))
     if not math.isnan(edge) and _at(y, edge) >= a - tolerance:
         peak, a = edge, _at(y, edge)
@@ -326,17 +327,6 @@ def shape_of_curve(
 
 def _at(y: Curve, time: float) -> float:
     return float(y(np.array([time]))[0])
-
-
-def _turning_point(y: Curve, low: float, high: float) -> float:
-    """Where the rate changes its sign, smoothly or at an edge."""
-
-    def rate(t: float) -> float:
-        return float(y.slope(np.array([t]))[0])
-
-    if not rate(low) > 0.0 > rate(high):
-        return low if rate(low) <= 0.0 else high
-    return float(brentq(rate, low, high, xtol=1e-15 * (high - low), rtol=1e-15))
 
 
 def shape_of_half_cycle(cycle: HalfCycle) -> Shape:

@@ -17,7 +17,6 @@ from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import fdtrc
 
 from relay_autotune.arrays import ComplexArray, FloatArray
@@ -45,6 +44,7 @@ from relay_autotune.process.structures import (
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.record.record import Record
+from relay_autotune.scalar import root
 
 _NEAREST = 3
 _REACH = 3.0
@@ -130,7 +130,7 @@ def _crossing(
     if falls.size == 0:
         return None
     i = int(falls[np.argmin(np.abs(np.log(grid[falls] / near)))])
-    w = float(brentq(excess, grid[i], grid[i + 1], xtol=1e-300, rtol=1e-14))
+    w = root(excess, grid[i], grid[i + 1])
     size = float(logarithm(np.array([w]))[0][0])
     return UltimatePoint(math.copysign(math.exp(-size), sign), w)
 

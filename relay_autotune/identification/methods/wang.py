@@ -37,7 +37,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from relay_autotune.arrays import FloatArray
@@ -56,6 +55,7 @@ from relay_autotune.identification.methods.solved import solved
 from relay_autotune.identification.result import Identification
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.record.record import Record
+from relay_autotune.scalar import root
 
 # A/(mu A_0), the limit of eq 25 for T -> infinity: the triangle of an integrator.
 INTEGRATOR_RATIO = 0.5 * math.pi
@@ -139,7 +139,7 @@ def fopdt_from_unbiased(
             f"{amplitude:g} and |G| = {response:g} at its fundamental: the process is of another "
             "structure, or noise spoils the peaks; try the waveform method"
         )
-    q = float(brentq(excess, _SMALLEST_Q, _LARGEST_Q, xtol=1e-300, rtol=1e-15))
+    q = root(excess, _SMALLEST_Q, _LARGEST_Q)
     return fopdt_with_gain(amplitude / (relay * math.tanh(q)), period, amplitude, relay, level)
 
 
@@ -161,7 +161,7 @@ def rise_time_constant(rise: float, rise_half: float) -> float:
         )
     ratio = rise / rise_half
     top = (2.0 / ratio) ** (1.0 / (ratio - 1.0))
-    x = float(brentq(lambda x: 2.0 * x - x**ratio - 1.0, 0.5, top, xtol=1e-300, rtol=1e-15))
+    x = root(lambda x: 2.0 * x - x**ratio - 1.0, 0.5, top)
     return -rise_half / math.log(x)
 
 
