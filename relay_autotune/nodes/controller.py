@@ -481,7 +481,6 @@ class ControllerNode(ServedNode):
     async def _prepare_verification(self, request: Verify.Goal) -> Verifiable:
         if self._held:
             raise NotReadyError(Code.TUNING())
-        self._verifier.require_samples()
         self._predictors.require_any()
         if self._remote is None and self._untaken:
             raise NotReadyError(Code.NOBODY_SUBSCRIBES(topic=self._commands.topic_name))

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from rclpy.task import Future
@@ -56,6 +56,7 @@ _TIMES_PLANNED = 4.0
 _MORE_THAN_PLANNED = 10.0
 
 _Sample = tuple[float, float, float]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -233,14 +234,6 @@ class Verifier:
 
     # Beginning.
 
-    def require_samples(self) -> None:
-        """Refuse a loop without samples.
-
-        :raises NotReadyError: if there are too few samples to know the loop's rest.
-        """
-        if len(self._recent) < _LEAST_BEFORE:
-            raise NotReadyError(Code.FEW_SAMPLES(samples=len(self._recent), needed=_LEAST_BEFORE))
-
     def _accept(self, goal: Any) -> None:
         patience, why = goal.request.patience, NONE
         if self._action.running is not None:
@@ -283,12 +276,14 @@ class Verifier:
         """Put the gains on trial, make the steps, and return verdict and reason."""
         tried = await self._verifiable(request)
         self._require_on()
+        await self._once_ready(self._require_samples, time.monotonic() + request.patience)
         if tried.new is not None:
             await self._on_trial(tried)
             self._require_on()
             shown = self._recent[-1][0] - self._recent[0][0]
             await self._settled(tried.settles if math.isfinite(tried.settles) else shown)
-        rest, period = await self._rested(tried.steps, time.monotonic() + request.patience)
+        until = time.monotonic() + request.patience
+        rest, period = await self._once_ready(lambda: self._at_rest(tried.steps), until)
         loop, noise = (tried.control, tried.model), rest.noise_std
         plans = await self._computed(lambda: [plan(*loop, s, period, noise) for s in tried.steps])
         for step, planned in zip(tried.steps, plans, strict=True):
@@ -375,17 +370,16 @@ class Verifier:
             await self._woken()
         self._is_settling = False
 
-    async def _rested(self, steps: Sequence[Step], until: float) -> tuple[Rest, float]:
-        """Return the loop's state of rest and its sample period [s], as soon as it is at rest.
+    async def _once_ready(self, look: Callable[[], T], until: float) -> T:
+        """Return what a look at the loop returns, as soon as it refuses no more.
 
-        :param steps: that are to be made.
+        :param look: raises NotReadyError.
         :param until: how long to wait, on the steady clock [s].
-        :raises NotReadyError: if it does not come to rest.
+        :raises NotReadyError: that of the last look.
         """
         while True:
             try:
-                self.require_samples()
-                found = self._at_rest(steps)
+                found = look()
             except NotReadyError as error:
                 if time.monotonic() >= until:
                     raise
@@ -395,6 +389,11 @@ class Verifier:
                 return found
             await self._woken()
 
+    def _require_samples(self) -> None:
+        """Refuse a loop whose samples are too few to know its rest."""
+        if len(self._recent) < _LEAST_BEFORE:
+            raise NotReadyError(Code.FEW_SAMPLES(samples=len(self._recent), needed=_LEAST_BEFORE))
+
     def _pace(self) -> float:
         """Return the steady time for one second of the samples' time."""
         ours = self._arrivals[-1] - self._arrivals[0]
@@ -403,6 +402,7 @@ class Verifier:
 
     def _at_rest(self, steps: Sequence[Step]) -> tuple[Rest, float]:
         """Return the loop's state of rest and its sample period [s]."""
+        self._require_samples()
         t, y, u = np.transpose(self._recent)
         period = float(np.median(np.diff(t)))
         if not period > 0.0:

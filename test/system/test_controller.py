@@ -293,6 +293,35 @@ def test_gains_for_another_law_are_proven_by_a_node_that_runs_it(rig: Rig) -> No
     assert 4 <= median(b - a for a, b in pairwise(changed)) <= 6
 
 
+def test_a_verification_waits_for_the_samples_of_a_slow_sensor(rig: Rig) -> None:
+    """It was refused while they were fewer than ten, which a slow sensor does not give in time."""
+    controller = rig.start(
+        "controller_node", initial_setpoint=5.0, kc=0.3, ti=0.8, verify_step=0.2
+    )
+    rig.listen("controller_command", Float64, RELIABLE)
+    sensor = rig.node.create_publisher(Float64, "measurement", RELIABLE)
+    models = rig.node.create_publisher(TransferFunction, "transfer_function", LATCHED)
+    model = TransferFunction(final=True, numerator=[2.0], denominator=[0.8, 1.0], dead_time=0.4)
+    model.experiment_id, model.verdict = "of a test", TransferFunction.VERDICT_TRUSTED
+    models.publish(model)
+    client = ActionClient(rig.node, Verify, "controller_node/verify")
+    rig.until(lambda: client.server_is_ready() and sensor.get_subscription_count(), "the node")
+    said = [""]
+
+    def sampled(expected: str) -> bool:
+        sensor.publish(Float64(data=5.0))
+        rig.run_for(0.3)
+        return expected in controller.log + said[-1]
+
+    rig.until(lambda: sampled("has a subscriber"), "the ear of the command")
+    client.send_goal_async(
+        Verify.Goal(patience=60.0), lambda message: said.append(message.feedback.status)
+    )
+    rig.until(lambda: "samples have come with a command" in said[-1], "the wait")
+    rig.until(lambda: sampled("step 1 of 1"), "the step")
+    client.destroy()
+
+
 def test_doubtful_gains_are_never_applied_by_themselves(rig: Rig) -> None:
     controller = rig.start("controller_node", **CONTROLLER, auto_apply=True)
     experiments = rig.node.create_publisher(RelayExperiment, "relay_experiment", LATCHED)
