@@ -58,6 +58,7 @@ from relay_autotune.identification.methods.solved import literally, solved, stru
 from relay_autotune.identification.result import Identification
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.structures import Structure, equal_lags
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 
 
@@ -221,7 +222,8 @@ class LagProblem:
         """Return how far a solution's half cycles are from the record's; 0 without a record."""
         if self.test is None:
             return 0.0
-        return shape_misfit(self.test, model, self.cycle, solution)
+        process = model.build((*solution, self.cycle.dead_time))
+        return shape_misfit(self.test, process, self.cycle)
 
     def choice(self) -> tuple[Structure, str]:
         """Return the simplest model that fits, and a sentence for the user.
@@ -396,7 +398,7 @@ def _identified(problem: LagProblem, known: Known, source: str, *, ideal: bool) 
             "keeps the limit cycle off the ultimate point; K_u and w_u are those of the model"
         )
     found = method.name, model, values, problem.reading
-    identification = solved(*found, test=test, sign=sign, remarks=remarks)
+    identification = solved(*found, sign=sign, late=extra_delay, remarks=remarks)
     if method is not ATV or not ideal:
         return identification
     spread = problem.reading.carried(lambda x: np.array(ultimate_estimate(problem.at(x))))
@@ -432,19 +434,15 @@ def alike(misfit: float, least: float) -> bool:
     return misfit <= _ALIKE * least + _ALIKE_SHARE
 
 
-def shape_misfit(
-    test: RelayTest, model: Structure, cycle: SymmetricCycle, solution: Solution
-) -> float:
-    """Return how far half cycles are from those of a solution, with noise, over the amplitude.
+def shape_misfit(test: RelayTest, process: TransferFunction, cycle: SymmetricCycle) -> float:
+    """Return how far half cycles are from those of a process, with noise, over the amplitude.
 
     :param test: the relay test.
-    :param model: the structure.
+    :param process: of positive gain, with the dead time that the relay added.
     :param cycle: its limit cycle.
-    :param solution: gain > 0 and time constants.
     """
     half = 0.5 * cycle.period
     time = half * (np.arange(_SHAPE_POINTS) + 0.5) / _SHAPE_POINTS
-    process = model.build((*solution, cycle.dead_time))
     seen = fold(test.record)
     away = HalfCycle(process, half, cycle.relay)(time) - seen.half(time)
     return math.hypot(float(np.sqrt(np.mean(away**2))), seen.noise_std) / cycle.amplitude

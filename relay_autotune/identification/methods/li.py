@@ -51,6 +51,7 @@ from relay_autotune.identification.methods.lags import (
 from relay_autotune.identification.methods.solved import Fit, literally, structure_asked_for
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.process.structures import Structure, equal_lags
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 
 METHOD = "li"
@@ -312,10 +313,12 @@ def _shape_misfit(
     tests: Sequence[RelayTest], cycles: Sequence[SymmetricCycle], fit: JointFit
 ) -> float:
     """Return how far the half cycles of all tests are from a model's, over their amplitudes."""
-    gain, *constants, dead_time = np.abs(fit.values).tolist()
-    delayed = [replace(cycle, dead_time=dead_time + cycle.dead_time) for cycle in cycles]
-    pairs = zip(tests, delayed, strict=False)
-    return math.hypot(*(shape_misfit(t, fit.model, c, (gain, *constants)) for t, c in pairs))
+    process = fit.model.build(np.abs(fit.values))
+
+    def late(cycle: SymmetricCycle) -> TransferFunction:
+        return replace(process, dead_time=process.dead_time + cycle.dead_time)
+
+    return math.hypot(*(shape_misfit(t, late(c), c) for t, c in zip(tests, cycles, strict=False)))
 
 
 def _cycle(test: RelayTest, read: Reading) -> SymmetricCycle:

@@ -24,7 +24,6 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.estimate import Estimate, jacobian
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.limit_cycle.fold import Reading
-from relay_autotune.identification.limit_cycle.limit_cycle import RelayTest
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.process.structures import LAG_N, Structure, equal_lags
 from relay_autotune.process.ultimate import ultimate_point
@@ -196,8 +195,8 @@ def solved(
     equations: Callable[[FloatArray], Sequence[float]],
     reading: Reading,
     *,
-    test: RelayTest | None = None,
     sign: int = 1,
+    late: float = 0.0,
     remarks: Sequence[str] = (),
 ) -> Identification:
     """Solve the equations of a method for what was read, and carry its scatter through them.
@@ -207,18 +206,16 @@ def solved(
     :param equations: from the numbers read to the values of the parameters, for a relay that
         turns the process upwards, with the dead time that the relay added.
     :param reading: the numbers.
-    :param test: the relay test, with its direction and the dead time that it added; None: numbers
-        of a chart.
-    :param sign: of the gain, where there is no relay test.
+    :param sign: of the gain.
+    :param late: dead time that the relay added [s].
     :param remarks: sentences for the user; empty ones are left out.
     :raises IdentificationError: if the equations have no solution.
     """
-    added = test.settings.extra_delay if test else 0.0
 
     def values(numbers: FloatArray) -> FloatArray:
         found = np.array(equations(numbers))
-        found[0] *= test.sign if test else sign
-        found[-1] = max(found[-1] - added, 0.0)
+        found[0] *= sign
+        found[-1] = max(found[-1] - late, 0.0)
         return found
 
     estimate = Estimate(structure, values(reading.values), reading.carried(values))

@@ -22,7 +22,6 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.limit_cycle.fold import Reading
 from relay_autotune.identification.limit_cycle.limit_cycle import (
-    RelayTest,
     SymmetricCycle,
     relay_test,
 )
@@ -191,8 +190,8 @@ def identify_thyagarajan(record: Record, known: Known = NOTHING) -> Identificati
         + (f": {row.text}" if row.text else "")
     )
     remarks = [why, *test.remarks(), *_refinements(shape, record)]
-    relay = test.settings.amplitude
-    return _identified(row, shape, reading, relay, asked.dead_time, test, remarks)
+    relay, late = test.sign * test.settings.amplitude, test.settings.extra_delay
+    return _identified(row, shape, reading, relay, asked.dead_time, remarks, late)
 
 
 def identify_numbers(shape: Shape, relay: float, known: Known, categorised: str) -> Identification:
@@ -206,7 +205,7 @@ def identify_numbers(shape: Shape, relay: float, known: Known, categorised: str)
     """
     reading = Reading(np.array([getattr(shape, name) for name in VARYING]))
     row = _chosen(shape, reading, known, categorised)
-    return _identified(row, shape, reading, relay, known.dead_time, None, [])
+    return _identified(row, shape, reading, relay, known.dead_time, [])
 
 
 def _chosen(shape: Shape, reading: Reading, known: Known, categorised: str = "") -> Row:
@@ -242,8 +241,8 @@ def _identified(
     reading: Reading,
     relay: float,
     dead_time: float,
-    test: RelayTest | None,
     remarks: list[str],
+    late: float = 0.0,
 ) -> Identification:
     """Solve a row, with a dead time that is known in the place of the time to the peak."""
     if not math.isnan(dead_time):
@@ -264,7 +263,7 @@ def _identified(
     if row.structure.order == 2 and math.isnan(dead_time):
         remarks += _sensitive(at(here))
     sign, found = 1 if relay > 0.0 else -1, (METHOD, row.structure, values, reading)
-    return solved(*found, test=test, sign=sign, remarks=remarks)
+    return solved(*found, sign=sign, late=late, remarks=remarks)
 
 
 def _sensitive(shape: Shape) -> list[str]:

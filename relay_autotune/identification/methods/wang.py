@@ -340,7 +340,8 @@ def identify_biased(record: Record, known: Known = NOTHING) -> Identification:
     reading = reading.with_number(7, 0.0, rest.std if rest.measured else 0.0)
     return solved(
         *("wang_biased", FOPDT, equations, reading),
-        test=test,
+        sign=sign,
+        late=settings.extra_delay,
         remarks=["" if rest.measured else UNKNOWN_REST, *test.remarks(symmetric=False)],
     )
 
@@ -378,7 +379,8 @@ def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
             remark, reading = _LIKE_AN_INTEGRATOR, reading.with_number(3, likely, std)
     return solved(
         *("wang_unbiased", FOPDT, equations, reading),
-        test=test,
+        sign=test.sign,
+        late=test.settings.extra_delay,
         remarks=[remark, *test.remarks(symmetric=False)],
     )
 
