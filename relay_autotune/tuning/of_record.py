@@ -16,7 +16,6 @@ from relay_autotune.identification.judgement.difference import Difference
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.posterior import DRAWS
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.quantities import LONGEST, SHORTEST
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Cycle, Record
@@ -54,13 +53,17 @@ def task_of_record(
     if unseen:
         options = replace(options, loop_delay=options.loop_delay + 0.5 * unseen)
         models = _spread_in_time(models, unseen, rng)
+    describing, settings = None, record.settings
+    if cycles and settings is not None:
+        average, sign = limit_cycle(cycles), chosen.model.process_sign
+        describing = describing_point_of_cycle(average, settings.amplitude, sign)
     return DesignTask(
         model=chosen.model,
         options=options,
         simple=simple,
         models=models,
         errors=None if beside is None else beside.draws(len(models), rng),
-        describing=_describing_point(record, cycles, chosen.model.process_sign),
+        describing=describing,
         recorded_period=_clock_of(record),
     )
 
@@ -150,17 +153,3 @@ def sampling_period(record: Record) -> float:
             f"the unit of the time"
         )
     return period
-
-
-def _describing_point(record: Record, cycles: Sequence[Cycle], sign: int) -> UltimatePoint | None:
-    """Return the describing function's ultimate point of the limit cycle; None without cycle."""
-    settings = record.settings
-    if not cycles or settings is None:
-        return None
-    cycle = limit_cycle(cycles)
-    amplitude = 0.5 * (cycle.peak_max - cycle.peak_min)
-    if not amplitude > 0.0:
-        return None
-    return describing_point_of_cycle(
-        cycle.period, cycle.period_high, amplitude, settings.amplitude, sign
-    )

@@ -41,6 +41,7 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
+from relay_autotune.record.record import CycleFeatures
 from relay_autotune.scalar import minimum_near, root
 from relay_autotune.tuning.task import DesignTask
 
@@ -227,21 +228,25 @@ def describing_point_of(model: TransferFunction) -> UltimatePoint | None:
 
 
 def describing_point_of_cycle(
-    period: float, period_high: float, amplitude: float, relay: float, sign: float
-) -> UltimatePoint:
+    cycle: CycleFeatures, relay: float, sign: float
+) -> UltimatePoint | None:
     """Return K_u and w_u that the describing function reads from a limit cycle that was recorded.
 
     ``K_u = 4 h/(pi a) sin(pi T_high/P)``: the first harmonic of the relay's wave over the
     amplitude; the sine is 1 for an unbiased relay.
 
-    :param period: P [s].
-    :param period_high: time with the command high [s].
-    :param amplitude: half of peak to peak of the measurement, a [y].
+    :param cycle: the limit cycle.
     :param relay: h [u].
     :param sign: of the process.
+    :return: None if the measurement does not move.
     """
-    gain = 4.0 * relay / (math.pi * amplitude) * math.sin(math.pi * period_high / period)
-    return UltimatePoint(math.copysign(gain, sign), 2.0 * math.pi / period)
+    amplitude = 0.5 * (cycle.peak_max - cycle.peak_min)
+    if not amplitude > 0.0:
+        return None
+    gain = (
+        4.0 * relay / (math.pi * amplitude) * math.sin(math.pi * cycle.period_high / cycle.period)
+    )
+    return UltimatePoint(math.copysign(gain, sign), 2.0 * math.pi / cycle.period)
 
 
 @dataclass(frozen=True)
