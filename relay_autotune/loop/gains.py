@@ -360,16 +360,6 @@ class SeriesForm:
         total = self.ti + self.td
         return Controller(self.kc * total / self.ti, total, self.ti * self.td / total, tf, b)
 
-    def transfer_function(self) -> TransferFunction:
-        """Return eq 11 as Luyben wrote it, with its first-order filter.
-
-        ``Gc = kc (ti s + 1)/(ti s) (td s + 1)/(alpha td s + 1)``.
-        """
-        lag = (self.alpha * self.td,)
-        if self.ti == 0.0:
-            return TransferFunction(self.kc, (self.td,), lag)
-        return TransferFunction(self.kc / self.ti, (self.ti, self.td), lag, 1)
-
 
 def series_form(controller: Controller) -> SeriesForm:
     """Return a controller in series form.

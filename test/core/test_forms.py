@@ -40,14 +40,6 @@ def test_the_gains_of_the_parallel_form(kc, ti, td, tf):
     np.testing.assert_allclose(isa.transfer_function()(S), law * filtered(tf), rtol=1e-6)
 
 
-def test_eq_11_as_luyben_wrote_it():
-    law = 1.69 * (11.5 * S + 1.0) / (11.5 * S) * (1.15 * S + 1.0) / (0.115 * S + 1.0)
-    found = SeriesForm(1.69, 11.5, 1.15).transfer_function()(S)
-    np.testing.assert_allclose(found, law, rtol=1e-12)
-    law = 2.0 * (0.5 * S + 1.0) / (0.05 * S + 1.0)
-    np.testing.assert_allclose(SeriesForm(2.0, 0.0, 0.5).transfer_function()(S), law, rtol=1e-12)
-
-
 def test_actions_that_are_not_there_stay_away():
     assert series_form(Controller(2.0, 4.0)) == SeriesForm(2.0, 4.0, 0.0, 0.0)
     assert series_form(Controller(2.0, 0.0, 0.5, 0.05)) == SeriesForm(2.0, 0.0, 0.5, 0.1)
