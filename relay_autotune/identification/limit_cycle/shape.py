@@ -15,7 +15,7 @@ How its peaks grow from the first one tells, too.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -261,19 +261,13 @@ def _widened(shape: Shape) -> float:
 
 
 def shape_of_curve(
-    y: Curve,
-    half_period: float,
-    growth: float = math.nan,
-    *,
-    edge: float = math.nan,
-    tolerance: float = 0.0,
+    y: Curve, half_period: float, *, edge: float = math.nan, tolerance: float = 0.0
 ) -> Shape:
     """Measure the shape of one half of a limit cycle.
 
     :param y: deviation from the set-point; the half begins with the switch at t = 0 and the
         curve goes on before and after it.
     :param half_period: T [s].
-    :param growth: tau_G/P, see :class:`Shape`.
     :param edge: where the rate is known to jump [s]; NaN: nowhere.
     :param tolerance: how much lower than the highest point the edge may lie and still count as
         the peak [y]; on a flat top noise would place it anywhere.
@@ -321,7 +315,6 @@ def shape_of_curve(
         rise_half=half - zero,
         sharpness=(tenth_down - peak) / (half_down - peak),
         plateau=(tenth_down - tenth) / half_period,
-        growth=growth,
     )
 
 
@@ -334,8 +327,8 @@ def shape_of_half_cycle(cycle: HalfCycle) -> Shape:
 
     :param cycle: the limit cycle.
     """
-    growth = normalised_growth(cycle.multiplier())
-    return shape_of_curve(cycle, cycle.half_period, growth)
+    shape = shape_of_curve(cycle, cycle.half_period)
+    return replace(shape, growth=normalised_growth(cycle.multiplier()))
 
 
 # The numbers of a shape that vary from cycle to cycle.
@@ -350,9 +343,9 @@ def shape_of_record(record: Record, *, sharp: bool = False) -> Shape:
     :param sharp: True if the peaks are known to be sharp, however much noise there is.
     :raises IdentificationError: if the record holds no whole cycle, or none about its set-point.
     """
-    whole = fold(record, sharp=sharp)
+    shape = shape_of_fold(fold(record, sharp=sharp))
     noise = 0.0 if math.isnan(record.noise_std) else record.noise_std
-    return shape_of_fold(whole, growth_time(envelope(record), noise) / whole.period)
+    return replace(shape, growth=growth_time(envelope(record), noise) / shape.period)
 
 
 def read_shape(record: Record, *, sharp: bool = False) -> tuple[Shape, Reading]:
@@ -387,11 +380,10 @@ class _Half:
         return self.sign * self.whole.slope(time + self.begin)
 
 
-def shape_of_fold(period: Fold, growth: float = math.nan) -> Shape:
+def shape_of_fold(period: Fold) -> Shape:
     """Return the shape of an averaged period, the mean of its two halves.
 
     :param period: the averaged period.
-    :param growth: tau_G/P, see :class:`Shape`.
     :raises IdentificationError: if a half never passes the set-point.
     """
     # The switch to low begins the half above the set-point; if reverse-acting, the one below.
@@ -399,5 +391,5 @@ def shape_of_fold(period: Fold, growth: float = math.nan) -> Shape:
     hints = {"edge": period.edge, "tolerance": period.tolerance}
     low = shape_of_curve(_Half(period, period.period_high, sign), period.period_low, **hints)
     high = shape_of_curve(_Half(period, 0.0, -sign), period.period_high, **hints)
-    means = {f.name: 0.5 * (getattr(low, f.name) + getattr(high, f.name)) for f in fields(Shape)}
-    return Shape(**{**means, "growth": growth})
+    pairs = zip(astuple(low), astuple(high), strict=True)
+    return Shape(*(0.5 * (a + b) for a, b in pairs))
