@@ -287,7 +287,7 @@ class _Designs:
         for name, make in COMPENSATORS.items():
             try:
                 made = make(task)
-                found.append((made, analyse_loop(made.law, task.in_loop(task.model))))
+                found.append((made, analyse_loop(made.law, task.process)))
             except TuningError as error:
                 self.refused[name] = str(error)
         return found

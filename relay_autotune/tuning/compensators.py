@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import InternalModelLaw
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.rules.formulas import fopdt_of, named, process_of
+from relay_autotune.tuning.rules.formulas import fopdt_of, named
 from relay_autotune.tuning.task import DesignTask
 
 DEAD_TIME_LAMBDA = 2.0
@@ -78,7 +78,7 @@ def high_order_compensator(task: DesignTask) -> Compensator:
     :param task: a process of two or more equal lags; its ``closed_loop_time`` is lambda.
     :raises TuningError: for any other.
     """
-    model = process_of(task)
+    model = task.process
     lags = model.time_constants
     equal = len(lags) >= 2 and all(
         t.imag == 0.0 and abs(t - lags[0]) <= _EQUAL * abs(lags[0]) for t in lags

@@ -153,12 +153,10 @@ class DesignTask:
     describing: UltimatePoint | None = None
     recorded_period: float = 0.0
 
-    def in_loop(self, model: TransferFunction) -> TransferFunction:
-        """Return a process with the dead time that the loop adds to it.
-
-        :param model: the process, or a model within its uncertainty.
-        """
-        return replace(model, dead_time=model.dead_time + self.options.added_delay)
+    @property
+    def process(self) -> TransferFunction:
+        """The process as a continuous controller meets it, with the delay that the loop adds."""
+        return replace(self.model, dead_time=self.model.dead_time + self.options.added_delay)
 
     def held(self, model: TransferFunction) -> TransferFunction:
         """Return a process with the loop's own delay, but no dead time for the hold.

@@ -278,7 +278,7 @@ class PageModel:
         case, shaping = self.case, self.shaping
         if case.present is None or shaping is None or performance_of(case.present, case) is None:
             return None
-        loop = Loop(case.present, shaping.task.in_loop(shaping.task.model))
+        loop = Loop(case.present, shaping.task.process)
         return _steps(loop, shaping.task, np.empty(0, dtype=bool), *self._scale(case.present))
 
     def case_with(self, shaped: DesignResult) -> Case:
@@ -318,7 +318,7 @@ class PageModel:
         """Return duration and load of the steps, which stay the same while gains change."""
         if self._shown is None:
             assert self.shaping is not None
-            model = self.shaping.task.in_loop(self.shaping.task.model)
+            model = self.shaping.task.process
             best = self.case.best_gains or gains
             self._shown = step_duration(best, model), shown_load(best, model)
         return self._shown
@@ -374,7 +374,7 @@ def _steps(
 def _curve(gains: Gains, shaping: Shaping) -> LoopCurve:
     task = shaping.task
     loop = task.loop(gains)
-    w = loop_frequencies(gains.loop(task.in_loop(task.model)))
+    w = loop_frequencies(gains.loop(task.process))
     if loop.law.period > 0.0:
         w = w[w * loop.law.period < math.pi]
     values = loop(1j * w)

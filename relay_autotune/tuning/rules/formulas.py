@@ -69,11 +69,6 @@ class Reduced:
         return self.delay / self.lag
 
 
-def process_of(task: DesignTask) -> TransferFunction:
-    """Return the process as the controller meets it, with the delay that the loop adds."""
-    return task.in_loop(task.model)
-
-
 def named(model: TransferFunction) -> str:
     """Return in words what a model is, for a refusal."""
     if model.structure != "general":
@@ -125,7 +120,7 @@ def own_point(rule: str, task: DesignTask) -> UltimatePoint:
     :param rule: name of the rule.
     :raises TuningError: if it has none, or is unstable.
     """
-    model = process_of(task)
+    model = task.process
     if model.grows:
         raise TuningError(
             f"the rule {rule} is for processes that are stable or integrate, found "
@@ -405,7 +400,7 @@ def unstable(task: DesignTask) -> tuple[Controller, str]:
     :param task: an unstable process of one or two real lags; its ``closed_loop_time`` is lambda.
     :raises TuningError: for any other, or where no lambda makes the loop stable.
     """
-    model = process_of(task)
+    model = task.process
     lags = sorted((t for t in model.time_constants), key=lambda t: t.real)
     first_order = len(lags) == 1 and lags[0].real < 0.0
     second_order = len(lags) == 2 and lags[0].real < 0.0 < lags[1].real

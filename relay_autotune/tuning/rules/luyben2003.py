@@ -41,7 +41,7 @@ from relay_autotune.loop.gains import Controller, SeriesForm
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.scalar import minimum_near, root
-from relay_autotune.tuning.rules.formulas import named, process_of, wants_pid
+from relay_autotune.tuning.rules.formulas import named, wants_pid
 from relay_autotune.tuning.task import DesignTask
 
 _POINTS = 800
@@ -247,7 +247,7 @@ def derivative(
 
 
 def _process(rule: str, task: DesignTask) -> TransferFunction:
-    model = process_of(task)
+    model = task.process
     if model.integrators != 1 or model.grows:
         raise TuningError(
             f"the rule {rule} is for a process with one integrator, found {named(task.model)}: "

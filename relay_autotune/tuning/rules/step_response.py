@@ -45,7 +45,6 @@ from relay_autotune.tuning.rules.formulas import (
     controller,
     is_first_order,
     named,
-    process_of,
     wants_pid,
 )
 from relay_autotune.tuning.task import DesignTask
@@ -136,7 +135,7 @@ def amigo(task: DesignTask) -> tuple[Controller, str]:
         without much overshoot or inverse response.
     :raises TuningError: for any other, or without delay.
     """
-    step = step_response(process_of(task))
+    step = step_response(task.process)
     k, t, delay = step.gain, step.lag, step.delay
     pid = wants_pid("amigo", task)
     if not delay > 0.0:
@@ -172,7 +171,7 @@ def simc(task: DesignTask) -> tuple[Controller, str]:
         ``closed_loop_time`` is tau_c.
     :raises TuningError: for any other, or without delay where tau_c is not given.
     """
-    model = process_of(task)
+    model = task.process
     pid = wants_pid("simc", task)
     tau_c, given = task.options.closed_loop(math.nan)
     process = half_rule(model, 2 if pid else 1, tau_c)

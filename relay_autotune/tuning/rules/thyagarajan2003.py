@@ -34,7 +34,6 @@ from relay_autotune.tuning.rules.formulas import (
     is_first_order,
     itae,
     named,
-    process_of,
     tyreus_luyben,
     wants_pid,
 )
@@ -65,7 +64,7 @@ def phase_margin(task: DesignTask) -> _Designed:
     :param task: a process of two real lags without zeros.
     :raises TuningError: for any other.
     """
-    model = process_of(task)
+    model = task.process
     lags = _real_lags(model)
     if len(lags) != 2:
         raise TuningError(
@@ -101,7 +100,7 @@ def lcmax(task: DesignTask) -> _Designed:
     :param task: a process of n >= 3 equal lags.
     :raises TuningError: for any other.
     """
-    model = process_of(task)
+    model = task.process
     lags = _real_lags(model)
     n = len(lags)
     if n < _LEAST_LAGS or max(lags) > min(lags) * (1.0 + _EQUAL):
@@ -128,7 +127,7 @@ def thyagarajan(task: DesignTask) -> _Designed:
     """
     if is_first_order(task.model):
         return _table_4(task)
-    model = process_of(task)
+    model = task.process
     if not model.is_stable:
         raise TuningError(
             f"the rule thyagarajan is for stable processes, found {named(task.model)}: use "
