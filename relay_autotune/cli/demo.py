@@ -123,17 +123,16 @@ def _watch(nodes: OwnNodes, output: Path) -> tuple[Path, Any]:
         client.why_lost = nodes.why_lost
 
         def wait(condition: Callable[[], object]) -> None:
-            while not client.wait(lambda: bool(condition()), _LOOK_EVERY):
-                if time.monotonic() > deadline:
-                    raise DemoError(
-                        f"the tune took longer than {_DEADLINE:g} s; the logs are in {output}"
-                    )
+            if not client.wait(lambda: bool(condition()), deadline - time.monotonic()):
+                raise DemoError(
+                    f"the tune took longer than {_DEADLINE:g} s; the logs are in {output}"
+                )
 
         seen = _Seen(client)
         start = f"{client.name}/start_tune"
         while not (answer := client.call(StartTune, start, StartTune.Request())).accepted:
             # The nodes may not have discovered each other yet.
-            wait(lambda: True)
+            wait(lambda: time.monotonic() < deadline)
             client.rest(_LOOK_EVERY)
         print("One service call, relay_node/start_tune:")
         print(f"  accepted: experiment {answer.experiment_id}", flush=True)

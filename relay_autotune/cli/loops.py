@@ -301,7 +301,6 @@ class TopicLoop(Loop):
         with Working(f"looking at {measurement} and {command}"):
             self._kind = client.kind_of(measurement, options.wait, published=True)
             self._command_kind = client.kind_of(command, options.wait, published=False)
-            client.require_uncontrolled()
         reader = self._reader()
         self._command_field = options.command_field or "data"
         with Working(f"listening to {measurement}"):
@@ -367,6 +366,13 @@ class TopicLoop(Loop):
     def _require_alone(self) -> None:
         """Refuse a loop that somebody else commands, with its name and what to do."""
         topic = self.options.command
+        if through := self.client.others_on("controller_command"):
+            raise LoopError(
+                f"{through} publishes {self.space}/controller_command: its commands would reach "
+                f"the actuator only until the nodes of this command end; stop it, or start "
+                f"relay_node and identifier_node yourself, and leave out --measurement and "
+                f"--command"
+            )
         if not (others := self.client.others_on(topic)):
             return
         commands, says, at = self._commands, "", ""

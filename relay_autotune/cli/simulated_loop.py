@@ -11,8 +11,8 @@ ten seconds what each of them does.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -77,11 +77,6 @@ def installed(name: str) -> Path:
         ) from None
 
 
-def _require_alive(nodes: OwnNodes) -> None:
-    if lost := nodes.why_lost():
-        raise LoopError(lost)
-
-
 def _serve(nodes: OwnNodes) -> None:
     """Show the loop and take set-points, until Ctrl-C."""
     from std_msgs.msg import Float64
@@ -92,18 +87,15 @@ def _serve(nodes: OwnNodes) -> None:
 
         def now(seconds: float) -> float:
             came: list[Float64] = client.heard(Float64, "/measurement", bool, least=seconds)
-            _require_alive(nodes)
             if not came:
                 raise LoopError("plant_node publishes no measurement")
             return float(came[-1].data)
 
+        client.why_lost = nodes.why_lost
+        topics = ("/measurement", "/command")
         with Working("starting the nodes"):
-            began = time.monotonic()
-            while not (client.has_publisher("/measurement") and client.has_publisher("/command")):
-                _require_alive(nodes)
-                if time.monotonic() - began > START_WITHIN:
-                    raise LoopError(f"the nodes have not started within {START_WITHIN:g} s")
-                client.rest(0.1)
+            if not client.wait(lambda: all(map(client.has_publisher, topics)), START_WITHIN):
+                raise LoopError(f"the nodes have not started within {START_WITHIN:g} s")
         print(f"{', '.join(NODES)} run; the measurement is {now(0.1):.2f} y; Ctrl-C ends them")
         while sys.stdin.isatty():
             try:
@@ -122,6 +114,4 @@ def _serve(nodes: OwnNodes) -> None:
             for second in range(1, _SHOWN + 1):
                 print(f"  {second:2d} s  measurement {now(1.0):.2f} y", flush=True)
         sys.stdout.flush()
-        while True:
-            _require_alive(nodes)
-            time.sleep(0.5)
+        client.rest(math.inf)

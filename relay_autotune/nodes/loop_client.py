@@ -401,20 +401,6 @@ class LoopClient:
         meant = f"; type {flag} {first}" if first else ""
         raise LoopError(f"{name} has no {what} within {patience:g} s{meant}{others}")
 
-    def require_uncontrolled(self) -> None:
-        """Refuse a namespace in which a controller commands through relay_node.
-
-        :raises LoopError: with its name, and what to do.
-        """
-        topic = self._resolved("controller_command")
-        controllers = self._node.get_publishers_info_by_topic(topic)
-        if controllers:
-            raise LoopError(
-                f"{quality.who(controllers[0])} publishes {topic}: its commands would reach the "
-                f"actuator only until the nodes of this command end; stop it, or start relay_node "
-                f"and identifier_node yourself, and leave out --measurement and --command"
-            )
-
     def others_on(self, topic: str) -> str:
         """Return the names of the nodes that publish a topic, but this and the one called most.
 

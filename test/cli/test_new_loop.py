@@ -175,6 +175,7 @@ class Looker:
 
     takes = "std_msgs/msg/Float64"
     name = "/tank/relay_node"
+    through = ""
 
     def __init__(
         self,
@@ -194,14 +195,11 @@ class Looker:
         return [] if math.isnan(found) else [found]
 
     def others_on(self, topic: str) -> str:
-        return self.others
+        return self.through if topic == "controller_command" else self.others
 
     def claim(self, kind: Any, topic: str) -> Callable[[], object]:
         self.claims = True
         return lambda: setattr(self, "claims", False)
-
-    def require_uncontrolled(self) -> None:
-        pass
 
 
 def options(*words: str) -> argparse.Namespace:
@@ -325,6 +323,10 @@ def test_a_loop_that_somebody_else_commands_is_refused_before_any_question(
         TopicLoop(Looker(present=2.25, others="/pid"), options())
     with pytest.raises(LoopError, match=r"/gui commands /tank/valve: .* start again$"):
         TopicLoop(Looker(others="/gui"), options())
+    controlled = Looker()
+    controlled.through = "/tank/pid"
+    with pytest.raises(LoopError, match="/tank/pid publishes /tank/controller_command: its"):
+        TopicLoop(controlled, options())
     # A second tune_loop sees the first before its relay_node is there.
     loop = TopicLoop(client := Looker(), options("--web"))
     assert client.claims
