@@ -103,6 +103,7 @@ class Done:
     :param said: sentences for standard error.
     :param text: the table, or the document on one line; empty: there is none.
     :param error: why nothing was found; empty: something was.
+    :param analyses: those of its experiments, in the process that made them.
     """
 
     name: str
@@ -110,18 +111,19 @@ class Done:
     said: tuple[str, ...]
     text: str
     error: str = ""
+    analyses: tuple[Analysis, ...] = ()
 
 
 def work(job: Job) -> Done:
-    """Read, identify and tune; an error becomes part of the result.
+    """Do a job for another process, which needs no more than texts.
 
     :param job: what to do.
     """
-    return replay(job)[0]
+    return replace(replay(job), analyses=())
 
 
-def replay(job: Job, working: Working | None = None) -> tuple[Done, tuple[Analysis, ...]]:
-    """Read, identify and tune; return also the analyses themselves.
+def replay(job: Job, working: Working | None = None) -> Done:
+    """Read, identify and tune; an error becomes part of the result.
 
     :param job: what to do.
     :param working: is told how much of a bag is read, and what the computation is at.
@@ -135,17 +137,17 @@ def replay(job: Job, working: Working | None = None) -> tuple[Done, tuple[Analys
             for each in analyses:
                 if lines := compared_lines(each, job.present, job.table_width or WIDEST):
                     said.append("\n".join([f"{job.name}:", *lines]))
-            return Done(job.name, status_of(analyses), tuple(said), text), analyses
+            return Done(job.name, status_of(analyses), tuple(said), text, analyses=analyses)
     except SelectionError as error:
         command = shlex.join(("replay", *job.paths))
-        return _failed(job, said, error.told(command), USAGE), ()
+        return _failed(job, said, error.told(command), USAGE)
     except RelayAutotuneError as error:
-        return _failed(job, said, str(error), NOTHING_FOUND), ()
+        return _failed(job, said, str(error), NOTHING_FOUND)
     except Exception as error:
         if os.environ.get(DEBUG):
             raise
         why = f"{job.name} could not be analysed: {defect(error)}"
-        return _failed(job, said, why, NOTHING_FOUND), ()
+        return _failed(job, said, why, NOTHING_FOUND)
     status = status_of(analyses)
     if status == NOTHING_FOUND:
         # A table has the reason for a model without gains.
@@ -154,7 +156,7 @@ def replay(job: Job, working: Working | None = None) -> tuple[Done, tuple[Analys
             for a in analyses
             if not (a.models and job.table_width)
         ]
-    return Done(job.name, status, tuple(said), _text(job, analyses)), analyses
+    return Done(job.name, status, tuple(said), _text(job, analyses), analyses=analyses)
 
 
 def status_of(analyses: Sequence[Analysis]) -> int:

@@ -156,18 +156,18 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     named = options.measurement is not None or options.command is not None
     if jobs[0].name_width:
         write(f"{heading(jobs[0].name_width)}\n", None)
-    for done, found in _in_order(jobs, options):
+    for done in _in_order(jobs, options):
         if named or not jobs[0].name_width:
             _tell(done)
         if done.text:
-            write(f"{done.text}\n", file if found else None)
+            write(f"{done.text}\n", file if done.analyses else None)
         status = worst(status, done.status)
-        analyses += found
+        analyses += done.analyses
         if options.report or options.web:
             # Imported here, since a table needs none of the report.
             from relay_autotune.report.case import case_of, unreadable
 
-            cases += [case_of(analysis, done.name) for analysis in found]
+            cases += [case_of(analysis, done.name) for analysis in done.analyses]
             cases += [unreadable(done.name, done.error)] * bool(done.error and options.report)
     if analyses and options.report:
         write_report(as_asked(cases, options), options.report)
@@ -247,9 +247,7 @@ def _into_file(jobs: Sequence[Job], options: argparse.Namespace) -> int:
     return status
 
 
-def _in_order(
-    jobs: Sequence[Job], options: argparse.Namespace
-) -> Iterator[tuple[Done, tuple[Analysis, ...]]]:
+def _in_order(jobs: Sequence[Job], options: argparse.Namespace) -> Iterator[Done]:
     """Yield results in the order of the command line."""
     if options.jobs > 1 or options.scheduler:
         early: dict[int, Done] = {}
@@ -257,7 +255,7 @@ def _in_order(
         for number, done in _as_they_come(jobs, options):
             early[number] = done
             while due in early:
-                yield early.pop(due), ()
+                yield early.pop(due)
                 due += 1
         return
     for job in jobs:
@@ -277,7 +275,7 @@ def _as_they_come(jobs: Sequence[Job], options: argparse.Namespace) -> Iterator[
         yield from in_processes(jobs, options.jobs)
     else:
         for number, job in enumerate(jobs):
-            yield number, replay(job)[0]
+            yield number, replay(job)
 
 
 def _tell(done: Done) -> None:

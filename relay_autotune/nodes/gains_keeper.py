@@ -15,7 +15,6 @@ import fcntl
 import hashlib
 import json
 import os
-import stat
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
@@ -107,11 +106,8 @@ class GainsJournal:
         """
         path = self.path
         try:
-            # Without waiting for the other end of a pipe.
-            descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-            with os.fdopen(descriptor, "rb") as file:
-                is_file = stat.S_ISREG(os.fstat(descriptor).st_mode)
-                text = file.read(_LARGEST + 1) if is_file else b""
+            with path.open("rb") as file:
+                text = file.read(_LARGEST + 1)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
@@ -282,7 +278,10 @@ class GainsKeeper:
         else:
             self.history = found.within(self._is_allowed, present=True).after_restart(given)
         if self._goal is None:
-            self._write(self.history)
+            try:
+                journal.saving(self.history)()
+            except JournalError as error:
+                node.get_logger().error(str(error))
 
     @property
     def is_at_work(self) -> bool:
@@ -481,12 +480,6 @@ class GainsKeeper:
             self._node.get_logger().info(f"{self._place.sentence(self.history.gains)} again")
 
     # The disk.
-
-    def _write(self, history: GainsHistory) -> None:
-        try:
-            self._journal.saving(history)()
-        except RelayAutotuneError as error:
-            self._node.get_logger().error(str(error))
 
     async def _save(self, history: GainsHistory) -> None:
         """Save a state while the callbacks go on; return once it is on the disk.
