@@ -202,9 +202,7 @@ class _LoopOnPage:
         """Show the settings of the next tune."""
         self._loop.look()
         needed = self._loop.has_own_nodes
-        form = tuple(self._loop.answers.form(self._loop.form, needed=needed))
-        if form != self._live.told.form:
-            self._live.tell(form=form)
+        self._live.tell(form=tuple(self._loop.answers.form(self._loop.form, needed=needed)))
 
     def _is_set(self, wish: PageCommand) -> bool:
         """Take the settings with which a tune is to run; return whether they can be."""
@@ -474,28 +472,23 @@ class GainsPage:
             self.close()
             if found:
                 self._controller = GainsClient("", found[0], beside=self.loop.client)
-        controller, told = self._controller, self.live.told
-        if controller is None:
-            if told.controller:
-                self.live.tell(controller="", present="", step=math.nan)
-        else:
-            try:
-                present = controller.in_force()
-                # It comes of the record of the tune, which is large.
-                if self._step is None:
-                    self._step = controller.steps().usual() or math.nan
-            except RelayAutotuneError:
-                # It may be about to end: the next look tells.
-                self._looked = time.monotonic()
-                return
-            said = _said(present)
-            now = {"controller": controller.name, "present": said, "step": self._step}
-            if any(getattr(told, name) != value for name, value in now.items()):
-                self.live.tell(**now)
-            for subject in self.page.subjects:
-                if subject.loop == self.number and subject.case.present != present:
-                    subject.case = replace(subject.case, present=present)
         self._looked = time.monotonic()
+        if (controller := self._controller) is None:
+            if self.live.told.controller:
+                self.live.tell(controller="", present="", step=math.nan)
+            return
+        try:
+            present = controller.in_force()
+            # It comes of the record of the tune, which is large.
+            if self._step is None:
+                self._step = controller.steps().usual() or math.nan
+        except RelayAutotuneError:
+            # It may be about to end: the next look tells.
+            return
+        self.live.tell(controller=controller.name, present=_said(present), step=self._step)
+        for subject in self.page.subjects:
+            if subject.loop == self.number and subject.case.present != present:
+                subject.case = replace(subject.case, present=present)
 
     def look_after_tune(self, tune: Tuned) -> None:
         """Read the gains in force, and the usual step, which comes of the tune.

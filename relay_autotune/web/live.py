@@ -155,8 +155,9 @@ class Live:
         :param changed: fields of `Told`.
         """
         with self._lock:
-            self._told = replace(self._told, **changed)
-            self._is_new = True
+            told = replace(self._told, **changed)
+            self._is_new |= told != self._told
+            self._told = told
 
     def rest(self, status: str, *, good: bool, **changed: Any) -> None:
         """Tell that nothing is done any more, and how the last thing went.

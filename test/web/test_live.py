@@ -49,10 +49,13 @@ def test_a_page_that_is_opened_late_is_told_all_and_then_what_is_new():
     live.sample("command", 2.0)
     live.sample("command", math.nan)
 
+    # What is told again is not new.
+    statuses = iter(("at the low level", "at the high level"))
+
     async def listen(socket):
         first = await heard(socket, lambda m: m.get("all"))
         live.sample("measurement", 7.0)
-        live.tell(status="at the low level")
+        live.tell(status=next(statuses))
         seen = [await heard(socket, lambda m: "samples" in m or "live" in m)]
         while len(seen) < 2 and not {"samples", "live"} <= set(seen[0]):
             seen.append(await heard(socket, lambda m: "samples" in m or "live" in m))
