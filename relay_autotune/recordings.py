@@ -28,6 +28,7 @@ from relay_autotune.exchange.messages import (
     settings_from_message,
     stamp_nanoseconds,
     start_seconds,
+    unbroken,
 )
 from relay_autotune.quantities import result_fields
 from relay_autotune.record.record import (
@@ -331,7 +332,7 @@ def _rebuilt(topics: Topics, about: Mapping[str, str]) -> Record:
     answer = answer[answered]
     taken = samples.publish_time[answered]
     origin = int(taken[0])
-    cycles = _unbroken(topics.decoded(CYCLE, DEFAULTS[CYCLE]))
+    cycles = unbroken(topics.decoded(CYCLE, DEFAULTS[CYCLE]))
     try:
         return Record(
             time=(taken - origin) / 1e9,
@@ -349,17 +350,6 @@ def _rebuilt(topics: Topics, about: Mapping[str, str]) -> Record:
         )
     except RecordError as error:
         raise BagError(f"the samples in {topics.path} are of no use: {error}") from error
-
-
-def _unbroken(cycles: Sequence[Any]) -> list[Any]:
-    """Return the cycles without a gap in their numbers up to the newest, in order."""
-    by_index = {int(cycle.index): cycle for cycle in cycles}
-    run: list[Any] = []
-    index = max(by_index, default=-1)
-    while index in by_index:
-        run.insert(0, by_index[index])
-        index -= 1
-    return run
 
 
 def _cycle_start(cycles: Sequence[Any], taken: IntArray) -> tuple[int, ...]:

@@ -39,6 +39,9 @@ if TYPE_CHECKING:
     from relay_autotune.process.transfer_function import TransferFunction
 
 NANOSECONDS = 1_000_000_000
+# The samples of a record, those of a cycle first.
+_OF_CYCLE = ("time", "measurement", "command")
+_SAMPLES = (*_OF_CYCLE, "receive_time", "command_time")
 
 
 def set_stamp(stamp: Any, nanoseconds: int) -> None:
@@ -167,11 +170,8 @@ def fill_experiment(message: Any, record: Record, *, arrays: bool = True) -> Non
     message.noise_std = float(record.noise_std)
     message.lost_samples = int(record.lost_samples)
     if arrays:
-        message.time = float64_array(record.time)
-        message.receive_time = float64_array(record.receive_time)
-        message.command_time = float64_array(record.command_time)
-        message.measurement = float64_array(record.measurement)
-        message.command = float64_array(record.command)
+        for name in _SAMPLES:
+            setattr(message, name, float64_array(getattr(record, name)))
         message.cycle_start = array.array("I", record.cycle_start)
 
 
@@ -188,12 +188,9 @@ def record_from_message(message: Any) -> Record:
             f"the experiment's outcome is {message.outcome}; "
             f"expected one of {', '.join(f'{o.value} ({o.name})' for o in Outcome)}"
         ) from error
+    samples: dict[str, Any] = {name: _column(getattr(message, name)) for name in _SAMPLES}
     return Record(
-        time=_column(message.time),
-        measurement=_column(message.measurement),
-        command=_column(message.command),
-        receive_time=_column(message.receive_time),
-        command_time=_column(message.command_time),
+        **samples,
         settings=settings_from_message(message.settings),
         noise_std=float(message.noise_std),
         cycle_start=tuple(int(i) for i in message.cycle_start),
@@ -252,40 +249,46 @@ def record_from_cycles(messages: Iterable[Any]) -> Record:
     :param messages: the messages, at least one.
     :raises RecordError: if there is none or their samples contradict each other.
     """
-    by_index = {int(m.index): m for m in messages}
-    if not by_index:
+    run = unbroken(messages)
+    if not run:
         raise RecordError("no cycle to join to a record; expected at least one")
-    newest = max(by_index)
-    first = newest
-    while first - 1 in by_index:
-        first -= 1
-    run = [by_index[i] for i in range(first, newest + 1)]
     for message in run:
         _check_cycle(message)
     start = stamp_nanoseconds(run[0].header.stamp)
-    columns: dict[str, list[FloatArray]] = {"time": [], "measurement": [], "command": []}
+    columns: dict[str, list[FloatArray]] = {name: [] for name in _OF_CYCLE}
     starts: list[int] = []
     length = 0
     for message in run:
         # The last sample of each cycle is the first one of the next.
         keep = slice(None) if message is run[-1] else slice(0, -1)
-        offset = (stamp_nanoseconds(message.header.stamp) - start) * 1e-9
-        time = _column(message.time)[keep] + offset
         starts.append(length + int(message.lead_in))
-        length += time.size
-        columns["time"].append(time)
-        columns["measurement"].append(_column(message.measurement)[keep])
-        columns["command"].append(_column(message.command)[keep])
-    joined = {name: np.concatenate(parts) for name, parts in columns.items()}
+        late = (stamp_nanoseconds(message.header.stamp) - start) * 1e-9
+        for name, parts in columns.items():
+            column = _column(getattr(message, name))[keep]
+            parts.append(column + late if name == "time" else column)
+        length += columns["time"][-1].size
+    joined: dict[str, Any] = {name: np.concatenate(parts) for name, parts in columns.items()}
     return Record(
-        time=joined["time"],
-        measurement=joined["measurement"],
-        command=joined["command"],
+        **joined,
         settings=settings_from_message(run[-1].settings),
         cycle_start=(*starts, length - 1),
         experiment_id=visible(str(run[-1].experiment_id)),
         start=start_seconds(start),
     )
+
+
+def unbroken(messages: Iterable[Any]) -> list[Any]:
+    """Return the cycles without a gap in their numbers up to the newest, in order.
+
+    :param messages: of cycles, in any order.
+    """
+    by_index = {int(message.index): message for message in messages}
+    run: list[Any] = []
+    index = max(by_index, default=-1)
+    while index in by_index:
+        run.insert(0, by_index[index])
+        index -= 1
+    return run
 
 
 def _check_cycle(message: Any) -> None:
@@ -382,11 +385,7 @@ def transfer_function_from_message(message: Any) -> TransferFunction:
     :raises ModelError: if its coefficients are no transfer function, or the arrays of its
         uncertainty do not go with its parameters.
     """
-    from relay_autotune.exchange.models import model_of_message
-
-    model = model_of_message(message)
-    identification_from_message(message)
-    return model
+    return identification_from_message(message).model
 
 
 def gains_from_message(message: Any) -> Gains:
