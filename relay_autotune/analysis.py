@@ -262,17 +262,35 @@ class _Tuning:
 def _chosen(record: Record, task: Task) -> _Chosen | Analysis:
     """Return the selected model; without a model, the analysis with the reason."""
     record = thinned(record)
+
+    def fit(part: Record) -> Identification:
+        return _guarded(part, task.method, task.known)
+
+    found = _identified((record,), lambda: fit(record))
+    if isinstance(found, Analysis):
+        return found
+    return replace(found, model=without_disturbance(found.model, record, found.cycles, fit))
+
+
+def _identified(
+    records: Sequence[Record], fit: Callable[[], Identification]
+) -> _Chosen | Analysis:
+    """Return the model of records, with how they were changed before among its warnings.
+
+    :return: without a model, the analysis with the reason.
+    """
+    first = records[0]
     cycles: tuple[Cycle, ...] = ()
     try:
-        sampling_period(record)
-        cycles = cycles_of(record)
-        chosen = _with_remarks(_guarded(record, task.method, task.known), (record,))
+        for record in records:
+            sampling_period(record)
+        cycles = cycles_of(first)
+        found = fit()
     except RelayAutotuneError as error:
-        return _nothing(record, cycles, error)
-    chosen = without_disturbance(
-        chosen, record, cycles, lambda part: _guarded(part, task.method, task.known)
-    )
-    return _Chosen(record, cycles, chosen)
+        reason = _with_outcome(first, str(error))
+        return Analysis(first, cycles, reason=reason, judgement=Judgement(refused=reason))
+    said = [record.unthinned.remark for record in records if record.unthinned is not None]
+    return _Chosen(first, cycles, replace(found, warnings=(*found.warnings, *said)))
 
 
 def _chosen_so_far(record: Record, task: Task) -> _Chosen | Analysis:
@@ -316,27 +334,16 @@ def analyse_jointly(
     """
     task = Task(method, rule, known, options or DesignOptions())
     records = [thinned(record) for record in records]
-    first = records[0]
-    cycles: tuple[Cycle, ...] = ()
-    try:
-        for record in records:
-            sampling_period(record)
-        cycles = cycles_of(first)
-        chosen = _with_remarks(identify_jointly(records, method, known), records)
-    except RelayAutotuneError as error:
-        return _nothing(first, cycles, error)
+    joint = _identified(records, lambda: identify_jointly(records, method, known))
+    if isinstance(joint, Analysis):
+        return joint
+    first, chosen = joint.record, joint.model
     told = unequal_amplitudes(records, chosen.model)
     if told:
         chosen = replace(chosen, warnings=(*chosen.warnings, told))
-    found = Analysis(first, cycles, assess((chosen,), first), 0)
+    found = Analysis(first, joint.cycles, assess((chosen,), first), 0)
     simple = _simple(records, known, chosen)
     return _judged(found, records, _Tuning(task, _first(rule), simple, rng))
-
-
-def _nothing(record: Record, cycles: tuple[Cycle, ...], error: RelayAutotuneError) -> Analysis:
-    """Return the analysis of a record without a model."""
-    reason = _with_outcome(record, str(error))
-    return Analysis(record, cycles, reason=reason, judgement=Judgement(refused=reason))
 
 
 def _judged(
@@ -367,12 +374,6 @@ def _judged(
     if judgement.verdict is Verdict.NONE:
         return _without_gains(found, judgement)
     return replace(tuned, judgement=judgement)
-
-
-def _with_remarks(found: Identification, records: Sequence[Record]) -> Identification:
-    """Add to a model's warnings how the records were changed before."""
-    said = [record.unthinned.remark for record in records if record.unthinned is not None]
-    return replace(found, warnings=(*found.warnings, *said))
 
 
 def _refusal(record: Record) -> str:
