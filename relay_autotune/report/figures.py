@@ -275,10 +275,8 @@ def rate_of(
     return grid[whole], np.asarray(smooth)[whole], np.asarray(rate)[whole]
 
 
-_NO_SAMPLES = "it needs the samples, which a result without its recording does not have"
+# Least number of samples of a phase plane.
 _FEWEST = 20
-_NO_MODEL = "nothing was identified"
-_NO_GAINS = "there are no gains"
 
 
 class Draw(Protocol):
@@ -295,7 +293,7 @@ class Plate:
     :param key: its name in files and in the page's links.
     :param title: what it shows.
     :param draw: draws it into an empty figure.
-    :param missing: why a case has no such figure; empty: it has one.
+    :param needs: what it takes, the first things first.
     :param reading: how it is to be read, what is good and what is bad.
     :param wide: True if it fills the page, False if two stand side by side.
     :param without_relay: how it is to be read where no relay acted; empty: the same way.
@@ -305,11 +303,18 @@ class Plate:
     key: str
     title: str
     draw: Draw
-    missing: Callable[[Case], str]
+    needs: tuple[Need, ...]
     reading: str
     height: Callable[[Case], tuple[float, float]]
     wide: bool = True
     without_relay: str = ""
+
+    def missing(self, case: Case) -> str:
+        """Return why a case has no such figure; empty: it has one.
+
+        :param case: the experiment.
+        """
+        return next((why for need in self.needs if (why := need(case))), "")
 
     def reading_of(self, case: Case) -> str:
         """Return how a case's figure is to be read.
@@ -332,50 +337,45 @@ class Plate:
         return figure
 
 
-def _without_samples(case: Case) -> str:
-    return "" if case.record is not None else _NO_SAMPLES
+# Returns what a case lacks, whose needs before that are there; empty: nothing.
+Need = Callable[[Case], str]
 
 
-def _without_fit(case: Case) -> str:
-    if case.record is None:
-        return _NO_SAMPLES
-    if case.model is None:
-        return _NO_MODEL
-    if case.model.found.fitted.size != len(case.record):
-        return f"the method {case.model.found.method} does not fit the samples themselves"
-    return ""
+def _fit(case: Case) -> str:
+    assert case.model is not None
+    assert case.record is not None
+    if case.model.found.fitted.size == len(case.record):
+        return ""
+    return f"the method {case.model.found.method} does not fit the samples themselves"
 
 
-def _without_cycles(case: Case) -> str:
-    if case.record is None:
-        return _NO_SAMPLES
+def _cycles(case: Case) -> str:
     if not case.cycles or case.limit_cycle is None:
         return "the record has no whole cycle"
+    assert case.record is not None
     return "" if len(case.record) >= _FEWEST else "the record has too few samples"
 
 
-def _without_gains(case: Case) -> str:
-    if case.model is None:
-        return _NO_MODEL
-    return "" if case.best_gains is not None else _NO_GAINS
+def _intervals(case: Case) -> str:
+    assert case.model is not None
+    if any(np.isfinite(e.low) for e in (*case.model.estimates, *case.model.ultimate)):
+        return ""
+    return f"the method {case.model.found.method} gives no uncertainty"
 
 
-def _without_other_rules(case: Case) -> str:
-    missing = _without_gains(case)
-    if missing:
-        return missing
+def _one_of(thing: str, why: str) -> Need:
+    return lambda case: "" if getattr(case, thing) is not None else why
+
+
+_SAMPLES = _one_of(
+    "record", "it needs the samples, which a result without its recording does not have"
+)
+_MODEL = _one_of("model", "nothing was identified")
+_GAINS = _one_of("best_gains", "there are no gains")
+
+
+def _other_rules(case: Case) -> str:
     return "" if len(distinct_gains(case)) > 1 else "no other rule gives other gains"
-
-
-def _without_model(case: Case) -> str:
-    return "" if case.model is not None else _NO_MODEL
-
-
-def _without_intervals(case: Case) -> str:
-    if case.model is None:
-        return _NO_MODEL
-    known = any(np.isfinite(e.low) for e in (*case.model.estimates, *case.model.ultimate))
-    return "" if known else f"the method {case.model.found.method} gives no uncertainty"
 
 
 PLATES = (
@@ -383,7 +383,7 @@ PLATES = (
         "experiment",
         "The experiment",
         draw_experiment,
-        _without_samples,
+        (_SAMPLES,),
         "The relay swings the command between two levels; the measurement answers with a limit "
         "cycle. Good: the numbered cycles look alike, and the swing is several times the "
         "hysteresis band. Bad: peaks that wander, a swing lost in noise, cycles marked as "
@@ -396,7 +396,7 @@ PLATES = (
         "fit",
         "Model over the data",
         draw_fit,
-        _without_fit,
+        (_SAMPLES, _MODEL, _fit),
         "Above: the model over the measurement. Below: the residual. Good: the residual is as "
         "wide as the band and has no pattern. Bad: it repeats with each cycle (the structure is "
         "too simple), or it drifts (a disturbance acted during the test).",
@@ -406,7 +406,7 @@ PLATES = (
         "phase_plane",
         "Limit cycle in the phase plane",
         draw_phase_plane,
-        _without_cycles,
+        (_SAMPLES, _cycles),
         "The rate of the measurement over the measurement itself. Good: the last cycles lie on "
         "one closed curve, and the model's curve on them. Bad: curves that do not close or do "
         "not coincide; corners that the model cuts.",
@@ -417,7 +417,7 @@ PLATES = (
         "nyquist",
         "Nyquist",
         draw_nyquist,
-        _without_gains,
+        (_MODEL, _GAINS),
         "The loop of recommended controller and process. Its distance from the point -1 is the "
         "robustness: the dashed circle touches it, and its radius is 1/Ms. The square and the "
         "triangle are where gain and phase margin are read. Good: the band stays away from the "
@@ -429,7 +429,7 @@ PLATES = (
         "bode",
         "Bode",
         draw_bode,
-        _without_model,
+        (_MODEL,),
         "The process alone. The diamonds come from Fourier integrals over whole cycles and need "
         "no model. Good: they lie on the curve. Bad: they leave the band, above all near the "
         "ultimate point.",
@@ -439,7 +439,7 @@ PLATES = (
         "closed_loop",
         "Closed loop, predicted",
         draw_closed_loop,
-        _without_gains,
+        (_MODEL, _GAINS),
         "A step of the set-point, then one of the load at the process input, on the identified "
         "model and on some of those within its uncertainty; dashed: with the gains before, where "
         "they are known. Good: one small overshoot and a quick return, on all of them. Bad: "
@@ -450,7 +450,7 @@ PLATES = (
         "rules",
         "The other rules",
         draw_rules,
-        _without_other_rules,
+        (_MODEL, _GAINS, _other_rules),
         "The same two steps with the gains of each other rule (solid), beside the recommended "
         "ones (dashed). IAE is the integral of the absolute error after a unit step of the load.",
         rules_height,
@@ -459,7 +459,7 @@ PLATES = (
         "uncertainty",
         "How sure the model is",
         draw_uncertainty,
-        _without_intervals,
+        (_MODEL, _intervals),
         "95 % intervals as distance from the estimate; within the shaded 20 % a quantity counts "
         "as determined. K_u and w_u decide the gains, and often have narrower intervals than the "
         "parameters. Good: the methods agree on them. Bad: a method that suits the test is far "
