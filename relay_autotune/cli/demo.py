@@ -226,13 +226,12 @@ def picture_title(found: Analysis) -> str:
 
 
 def _compare(case: Case) -> None:
-    model, gains = case.model, case.best_gains
-    assert model is not None
+    gains = case.best_gains
     assert gains is not None
     print("The process and what was identified (waveform fit):")
     print("                      true   identified     95 % interval          error")
     names = ("gain y/u", "time constant s", "dead time s", "K_u u/y", "w_u rad/s")
-    for name, found in zip(names, (*model.estimates, *model.ultimate), strict=True):
+    for name, found in zip(names, (*case.parameters, *case.ultimate), strict=True):
         interval = f"{digits(found.low)} to {digits(found.high)}"
         error = 100.0 * (found.value / found.truth - 1.0)
         found_text = f"{digits(found.value):>10}     {interval:<20} {error:+.2f} %"

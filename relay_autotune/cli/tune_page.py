@@ -50,7 +50,7 @@ from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.nodes.gains_client import GainsClient
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import process_text
-from relay_autotune.report.case import Case, EstimatedQuantity, case_of, model_case
+from relay_autotune.report.case import Case, EstimatedQuantity, case_of, ultimate_of
 from relay_autotune.result import Analysis
 from relay_autotune.text import digits
 from relay_autotune.verdict import Verdict
@@ -337,15 +337,14 @@ class _LoopOnPage:
         ultimate: dict[int, EstimatedQuantity],
     ) -> None:
         """Show a model over the data so far, and how its intervals narrow."""
-        case = model_case(found, None)
-        for each in case.ultimate:
+        for each in ultimate_of(found):
             if each.name == ULTIMATE_GAIN:
                 ultimate[cycle] = each
         record = None
         # Without the first cycle it is not known where the process was at rest.
         if {0, *(c.index for c in cycles)} == set(range(len(cycles))):
             record = record_from_cycles(cycles)
-        self._live.show("model", of_running(case, record, list(ultimate.items())))
+        self._live.show("model", of_running(found, record, list(ultimate.items())))
 
     def tick(self) -> None:
         """Heed what was wished or signalled since the last call."""

@@ -64,20 +64,6 @@ class EstimatedQuantity:
 
 
 @dataclass(frozen=True)
-class ModelCase:
-    """A model with its quantities as the report shows them.
-
-    :param found: what a method found.
-    :param estimates: its parameters.
-    :param ultimate: K_u and w_u, empty where the model has none.
-    """
-
-    found: Identification
-    estimates: tuple[EstimatedQuantity, ...] = ()
-    ultimate: tuple[EstimatedQuantity, ...] = ()
-
-
-@dataclass(frozen=True)
 class Case:
     """One experiment with its models and gains.
 
@@ -103,6 +89,7 @@ class Case:
     :param present: the gains that are in the controller now; None: not known.
     :param units: of the measurement, by "y", and of the command, by "u", as far as known.
     :param command: the command line that made the report; empty: not known.
+    :param truth: the true process, if it was simulated.
     """
 
     source: str
@@ -111,7 +98,7 @@ class Case:
     duration: float
     outcome: Outcome
     reason: str
-    models: tuple[ModelCase, ...] = ()
+    models: tuple[Identification, ...] = ()
     selected: int | None = None
     gains: tuple[Gains, ...] = ()
     recommended: int | None = None
@@ -127,16 +114,27 @@ class Case:
     present: Controller | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     command: str = ""
+    truth: TransferFunction | None = None
 
     @property
-    def model(self) -> ModelCase | None:
+    def model(self) -> Identification | None:
         """The selected model."""
         return None if self.selected is None else self.models[self.selected]
 
     @property
     def points(self) -> tuple[FrequencyPoint, ...]:
         """Points of the frequency response, by Fourier integrals over the cycles."""
-        return next((m.found.points for m in self.models if m.found.points), ())
+        return next((m.points for m in self.models if m.points), ())
+
+    @property
+    def parameters(self) -> tuple[EstimatedQuantity, ...]:
+        """The parameters of the selected model."""
+        return () if self.model is None else parameters_of(self.model, self.truth)
+
+    @property
+    def ultimate(self) -> tuple[EstimatedQuantity, ...]:
+        """K_u and w_u of the selected model, empty where it has none."""
+        return () if self.model is None else ultimate_of(self.model, self.truth)
 
     @property
     def best_gains(self) -> Gains | None:
@@ -168,7 +166,8 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
         duration=record.duration,
         outcome=record.outcome,
         reason=analysis.reason or record.reason,
-        models=tuple(model_case(m, truth) for m in analysis.models),
+        models=analysis.models,
+        truth=truth,
         selected=analysis.selected,
         gains=analysis.gains,
         recommended=analysis.recommended,
@@ -208,31 +207,32 @@ def around(model: Identification | None) -> tuple[TransferFunction, ...]:
     return () if model is None else ensemble(model, rng=np.random.default_rng(0))
 
 
-def model_case(found: Identification, truth: TransferFunction | None) -> ModelCase:
-    """Return a model as the report shows it.
+def parameters_of(
+    found: Identification, truth: TransferFunction | None = None
+) -> tuple[EstimatedQuantity, ...]:
+    """Return the parameters of a model with their intervals.
 
     :param found: the result of one method.
     :param truth: the true process, if it was simulated.
     """
     low, high = found.ci95_low, found.ci95_high
     structure = found.estimate.structure
-    estimates = tuple(
+    return tuple(
         EstimatedQuantity(
             p.name, float(value), float(low[i]), float(high[i]), structure.unit(p),
             p.name not in found.undetermined, true_value(p.name, found.model, truth),
         )
         for i, (p, value) in enumerate(zip(structure.parameters, found.values, strict=True))
     )  # fmt: skip
-    return ModelCase(found, estimates, _ultimate(found, truth))
 
 
-def given_model(model: TransferFunction) -> ModelCase:
+def given_model(model: TransferFunction) -> Identification:
     """Return a model of which nothing was measured.
 
     :param model: the transfer function.
     """
     nothing = np.empty(0)
-    return ModelCase(Identification("given", Estimate.of_model(model), nothing, nothing))
+    return Identification("given", Estimate.of_model(model), nothing, nothing)
 
 
 def true_value(parameter: str, model: TransferFunction, truth: TransferFunction | None) -> float:
@@ -256,10 +256,14 @@ def _kind(model: TransferFunction) -> tuple[int, int, int, bool]:
     return len(model.time_constants), len(model.zeros), model.integrators, model.grows
 
 
-def _ultimate(
-    found: Identification, truth: TransferFunction | None
+def ultimate_of(
+    found: Identification, truth: TransferFunction | None = None
 ) -> tuple[EstimatedQuantity, ...]:
-    """Return K_u and w_u with their intervals; nothing where the model has none."""
+    """Return K_u and w_u with their intervals; nothing where the model has none.
+
+    :param found: the result of one method.
+    :param truth: the true process, if it was simulated.
+    """
     if not math.isfinite(found.ultimate_gain):
         return ()
     true = ultimate_point(truth) if truth is not None else None
@@ -363,7 +367,8 @@ def _case(e: dict[str, Any], source: str, truth: TransferFunction | None) -> Cas
         duration=number(e["duration"]),
         outcome=Outcome[str(e["outcome"]).upper()],
         reason=str(e["reason"]),
-        models=tuple(model_case(m, truth) for m in models),
+        models=models,
+        truth=truth,
         selected=selected,
         gains=gains,
         recommended=_index(e["recommended"], gains),

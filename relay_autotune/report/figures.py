@@ -182,7 +182,7 @@ def draw_fit(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
     assert case.record is not None
     assert case.model is not None
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.3))
-    record, model = case.record, case.model.found
+    record, model = case.record, case.model
     _samples(above, record)
     above.plot(
         *thinned(record.time, model.fitted), color=VERMILLION, lw=1.7, ls=(0, (4, 1.2)),
@@ -234,8 +234,8 @@ def draw_phase_plane(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     axes.plot(y[time <= start], rate[time <= start], color=MUTED, lw=0.9, label="on the way")
     label = f"limit cycle, {len(steady)} cycle{'s' if len(steady) > 1 else ''}"
     axes.plot(y[inside], rate[inside], color=BLUE, lw=1.3, label=label)
-    if case.model is not None and case.model.found.fitted.size == len(record):
-        time, fitted, slope = rate_of(record, case.model.found.fitted, cycle.period)
+    if case.model is not None and case.model.fitted.size == len(record):
+        time, fitted, slope = rate_of(record, case.model.fitted, cycle.period)
         last = (time >= end - cycle.period) & (time <= end)
         axes.plot(
             fitted[last], slope[last], color=VERMILLION, lw=1.7, ls=(0, (4, 1.5)), label="model"
@@ -344,9 +344,9 @@ Need = Callable[[Case], str]
 def _fit(case: Case) -> str:
     assert case.model is not None
     assert case.record is not None
-    if case.model.found.fitted.size == len(case.record):
+    if case.model.fitted.size == len(case.record):
         return ""
-    return f"the method {case.model.found.method} does not fit the samples themselves"
+    return f"the method {case.model.method} does not fit the samples themselves"
 
 
 def _cycles(case: Case) -> str:
@@ -358,9 +358,9 @@ def _cycles(case: Case) -> str:
 
 def _intervals(case: Case) -> str:
     assert case.model is not None
-    if any(np.isfinite(e.low) for e in (*case.model.estimates, *case.model.ultimate)):
+    if any(np.isfinite(e.low) for e in (*case.parameters, *case.ultimate)):
         return ""
-    return f"the method {case.model.found.method} gives no uncertainty"
+    return f"the method {case.model.method} gives no uncertainty"
 
 
 def _one_of(thing: str, why: str) -> Need:

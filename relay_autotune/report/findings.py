@@ -187,7 +187,7 @@ def performance_of(present: Controller, case: Case) -> Performance | None:
     """
     if case.model is None:
         return None
-    return performance_beside(present, case.best_gains, case.model.found.model, case.added_delay)
+    return performance_beside(present, case.best_gains, case.model.model, case.added_delay)
 
 
 def compared_numbers(gains: Controller | None, does: Performance | None) -> list[Compared]:
@@ -257,7 +257,7 @@ def remarks_of(case: Case) -> tuple[str, ...]:
 
 def _noted(case: Case) -> tuple[str, ...]:
     """Return what model, gains and cycles have to say beside the checks."""
-    found = list(case.model.found.warnings) if case.model is not None else []
+    found = list(case.model.warnings) if case.model is not None else []
     if case.best_gains is not None:
         found += case.best_gains.warnings
     disturbed = [c.index + 1 for c in case.cycles if c.disturbed]
@@ -323,14 +323,14 @@ def doubts_of(case: Case) -> tuple[str, ...]:
     if model is None:
         return ()
     found = []
-    for estimate in model.estimates:
+    for estimate in case.parameters:
         if not estimate.determined:
             found.append(
                 f"The {estimate.title} is between {digits(estimate.low)} and "
                 f"{digits(estimate.high)} {estimate.unit}: more than 20 % to either side."
             )
-    if model.found.rivals:
-        share = 100.0 * sum(r.support for r in model.found.rivals)
+    if model.rivals:
+        share = 100.0 * sum(r.support for r in model.rivals)
         found.append(
             f"Other structures hold {digits(share, 2)} % of the support; they are listed below."
         )

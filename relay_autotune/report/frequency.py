@@ -15,12 +15,13 @@ import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.identification.result import Identification
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.loop.sampled import ClosedLoop, simulate_closed_loop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import NORMAL_95
-from relay_autotune.report.case import Case, EstimatedQuantity, ModelCase, in_loop
+from relay_autotune.report.case import Case, EstimatedQuantity, in_loop, ultimate_of
 from relay_autotune.report.findings import performance_of
 from relay_autotune.report.style import (
     BLUE,
@@ -64,7 +65,7 @@ def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> Non
     assert gains is not None
     assert case.model is not None
     axes = figure.subplots()
-    loop = gains.loop(in_loop(case, case.model.found.model))
+    loop = gains.loop(in_loop(case, case.model.model))
     w = loop_frequencies(loop)
     turn = np.exp(1j * np.linspace(0.0, 2.0 * math.pi, 181))
     near_point = -1.0 + turn / gains.ms
@@ -180,7 +181,7 @@ def draw_bode(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
 
     assert case.model is not None
     above, below = figure.subplots(2, 1, sharex=True)
-    model = case.model.found.model
+    model = case.model.model
     w = _bode_frequencies(case)
     if case.models_around:
         _band(above, w, np.array([np.abs(m(1j * w)) for m in case.models_around]))
@@ -200,8 +201,8 @@ def draw_bode(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
         # To first order, magnitude and angle have the deviation of the real and imaginary part.
         above.errorbar(at, np.abs(value), yerr=NORMAL_95 * std, label="measured, 95 %", **style)
         below.errorbar(at, lag, yerr=np.degrees(NORMAL_95 * std / np.abs(value)), **style)
-    if case.model.ultimate:
-        gain, frequency = case.model.ultimate
+    if case.ultimate:
+        gain, frequency = case.ultimate
         above.plot(
             [frequency.value], [1.0 / abs(gain.value)], "*", ms=12, color=VERMILLION,
             label="ultimate point, 1/K_u at w_u",
@@ -228,12 +229,12 @@ def _band(axes: Axes, w: FloatArray, values: FloatArray) -> None:
 def _bode_frequencies(case: Case) -> FloatArray:
     """Return frequencies around those that the experiment excited, or the model's corner."""
     assert case.model is not None
-    if case.model.ultimate:
-        middle = case.model.ultimate[1].value
+    if case.ultimate:
+        middle = case.ultimate[1].value
     elif case.limit_cycle is not None:
         middle = 2.0 * math.pi / case.limit_cycle.period
     else:
-        constants = [abs(c) for c in case.model.found.model.time_constants] or [1.0]
+        constants = [abs(c) for c in case.model.model.time_constants] or [1.0]
         middle = 1.0 / max(constants)
     return np.geomspace(0.02 * middle, 8.0 * middle, 400)
 
@@ -304,22 +305,22 @@ def uncertainty_height(case: Case) -> tuple[float, float]:
 def _groups(case: Case) -> list[tuple[str, list[_Row]]]:
     """Return the panels: the parameters, and K_u and w_u by each method."""
     assert case.model is not None
-    own = [_Row(e.title, e, e.value) for e in case.model.estimates if e.value != 0.0]
+    own = [_Row(e.title, e, e.value) for e in case.parameters if e.value != 0.0]
     found = [("parameters of the model", own)] if own else []
     for k, title in enumerate(("ultimate gain K_u by method", "ultimate frequency w_u by method")):
-        if case.model.ultimate:
-            centre = case.model.ultimate[k].value
-            models = [m for m in _each_method(case) if m.ultimate]
-            found.append((title, [_Row(m.found.method, m.ultimate[k], centre) for m in models]))
+        if case.ultimate:
+            centre = case.ultimate[k].value
+            each = [(m.method, ultimate_of(m, case.truth)) for m in _each_method(case)]
+            found.append((title, [_Row(n, both[k], centre) for n, both in each if both]))
     return found
 
 
-def _each_method(case: Case) -> list[ModelCase]:
+def _each_method(case: Case) -> list[Identification]:
     """Return one model of each method, the selected one first."""
     assert case.model is not None
-    found = {case.model.found.method: case.model}
+    found = {case.model.method: case.model}
     for model in case.models:
-        found.setdefault(model.found.method, model)
+        found.setdefault(model.method, model)
     return list(found.values())
 
 
@@ -361,7 +362,7 @@ def draw_closed_loop(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     assert case.best_gains is not None
     assert case.model is not None
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1.0))
-    model = in_loop(case, case.model.found.model)
+    model = in_loop(case, case.model.model)
     half = step_duration(case.best_gains, model)
     run = simulated(case.best_gains, model, half)
     for other in case.models_around[:: max(1, len(case.models_around) // _SHOWN)]:
@@ -420,7 +421,7 @@ def draw_rules(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
     """
     assert case.best_gains is not None
     assert case.model is not None
-    model = in_loop(case, case.model.found.model)
+    model = in_loop(case, case.model.model)
     half = step_duration(case.best_gains, model)
     best = simulated(case.best_gains, model, half)
     others = distinct_gains(case)[1:]

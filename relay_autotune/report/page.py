@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 import relay_autotune
 from relay_autotune.process.transfer_function import process_mathml, process_text
-from relay_autotune.report.case import Case
+from relay_autotune.report.case import Case, ultimate_of
 from relay_autotune.report.figures import PLATES, Plate
 from relay_autotune.report.findings import (
     Chip,
@@ -122,7 +122,7 @@ def _environment() -> Environment:
     # What the page says of a case, each by the function that finds the words.
     said = (
         *(steps_of, beside_present, change_of, warnings_of, checks_of, numbers_of),
-        *(remarks_of, doubts_of, repeats_of),
+        *(remarks_of, doubts_of, repeats_of, ultimate_of),
     )
     environment.globals |= {function.__name__: function for function in said}
     return environment

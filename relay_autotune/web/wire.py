@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from relay_autotune.arrays import FloatArray
+from relay_autotune.identification.result import Identification
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.record.record import Record
-from relay_autotune.report.case import Case, EstimatedQuantity, ModelCase
+from relay_autotune.report.case import Case, EstimatedQuantity, parameters_of, ultimate_of
 from relay_autotune.report.findings import (
     checks_of,
     compared_numbers,
@@ -85,11 +86,9 @@ def of_subject(subject: PageModel) -> dict[str, Any]:
         "verdict": _verdict(case),
         "checks": _checks(case),
         "reason": visible(case.reason),
-        "process": "" if model is None else process_text(model.found.model),
-        "structure": "" if model is None else model.found.structure,
-        "estimates": []
-        if model is None
-        else [_estimate(e) for e in (*model.estimates, *model.ultimate)],
+        "process": "" if model is None else process_text(model.model),
+        "structure": "" if model is None else model.structure,
+        "estimates": [_estimate(e) for e in (*case.parameters, *case.ultimate)],
         "record": _record(case),
         "rules": [{"rule": g.rule, "ms": short(np.array([g.ms, g.iae_load]))} for g in case.gains],
         "present": of_present(subject),
@@ -102,7 +101,7 @@ def of_subject(subject: PageModel) -> dict[str, Any]:
 
 
 def of_running(
-    model: ModelCase, record: Record | None, gains: Sequence[tuple[int, EstimatedQuantity]]
+    model: Identification, record: Record | None, gains: Sequence[tuple[int, EstimatedQuantity]]
 ) -> dict[str, Any]:
     """Return what a page shows of the newest model while a tune runs.
 
@@ -113,7 +112,7 @@ def of_running(
     :param gains: K_u of each model so far, with the number of whole cycles.
     """
     found: dict[str, Any] = {
-        "estimates": [_estimate(e) for e in (*model.estimates, *model.ultimate)],
+        "estimates": [_estimate(e) for e in (*parameters_of(model), *ultimate_of(model))],
         "gains": {
             "cycle": [cycle for cycle, _ in gains],
             **{
@@ -126,7 +125,7 @@ def of_running(
     if record is not None:
         few = slice(None, None, math.ceil(len(record) / _MOST_SIMULATED))
         time = record.time[few]
-        moved = response(model.found.model, time, record.input())
+        moved = response(model.model, time, record.input())
         rest = float(np.mean(record.measurement[few] - moved))
         found["data"] = [curve(record.time, record.measurement), curve(time, rest + moved)]
     return found
@@ -278,6 +277,6 @@ def _record(case: Case) -> dict[str, Any] | None:
         "model": None,
     }
     model = case.model
-    if model is not None and model.found.fitted.size == len(record):
-        found["model"] = curve(record.time, model.found.fitted)
+    if model is not None and model.fitted.size == len(record):
+        found["model"] = curve(record.time, model.fitted)
     return found

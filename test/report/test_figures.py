@@ -115,7 +115,7 @@ def test_the_band_of_the_nyquist_curve_holds_95_percent_of_its_models() -> None:
 def test_the_circle_of_ms_touches_the_loop_that_is_drawn() -> None:
     case = case_of(completed(), "tank")
     assert case.added_delay > 0.0
-    loop = case.best_gains.loop(in_loop(case, case.model.found.model))
+    loop = case.best_gains.loop(in_loop(case, case.model.model))
     nearest = np.abs(1.0 + loop(1j * np.geomspace(1e-3, 1.0, 20_000))).min()
     # The hold of the sampled loop, for which Ms is exact, is drawn as half a period of dead time.
     assert 1.0 / nearest == pytest.approx(case.best_gains.ms, rel=3e-3)

@@ -227,11 +227,11 @@ def test_a_document_gives_the_same_report_without_what_needs_samples(monkeypatch
         for name in ("kc", "ti", "td", "tf", "b", "ms", "ms_95", "gain_margin", "iae_load"):
             assert getattr(ours, name) == getattr(theirs, name)
     assert case.recommended == direct.recommended == 0
-    assert case.model.found.model == direct.model.found.model
-    for ours, theirs in zip(case.model.estimates, direct.model.estimates, strict=True):
+    assert case.model.model == direct.model.model
+    for ours, theirs in zip(case.parameters, direct.parameters, strict=True):
         assert (ours.name, ours.unit, ours.low) == (theirs.name, theirs.unit, theirs.low)
         assert ours.value == theirs.value
-    assert case.model.ultimate == direct.model.ultimate
+    assert case.ultimate == direct.ultimate
     assert case.limit_cycle.period == direct.limit_cycle.period
     assert case.models_around == direct.models_around
     assert len(case.models_around) == 100
@@ -309,7 +309,7 @@ def test_the_models_within_the_uncertainty_are_those_of_the_document(build, para
     direct = case_of(analysis, "bag").models_around
     assert len(set(direct)) > 80
     assert from_json(analysis).models_around == direct
-    assert {e.value for e in from_json(analysis).model.estimates} == set(values)
+    assert {e.value for e in from_json(analysis).parameters} == set(values)
 
 
 def test_the_band_shows_the_models_on_which_the_gains_were_judged() -> None:
@@ -328,14 +328,14 @@ def test_without_a_covariance_a_document_gives_no_models_around() -> None:
     for found in (known, tied):
         case = from_json(replace(fruitless(), models=(found,), selected=0))
         assert case.models_around == ()
-        assert [e.value for e in case.model.estimates] == list(found.values)
+        assert [e.value for e in case.parameters] == list(found.values)
 
 
 def test_a_simulated_process_is_compared_with_the_truth(tmp_path) -> None:
     written = document("bag", [completed()]) | {"truth": model_fields(MODEL)}
     (tmp_path / "result.json").write_text(to_json(written))
     (case,) = read_documents(tmp_path / "result.json")
-    truths = {e.name: e.truth for e in (*case.model.estimates, *case.model.ultimate)}
+    truths = {e.name: e.truth for e in (*case.parameters, *case.ultimate)}
     assert truths["gain"] == 1.65
     assert truths["time_constant"] == 20.0
     assert truths["dead_time"] == 10.0
@@ -371,7 +371,7 @@ def test_the_present_gains_stand_beside_the_new_ones_with_what_both_do(monkeypat
     weak = Controller(0.5 * case.best_gains.kc, case.best_gains.ti)
     rows = {row[0]: (row[1], new[1]) for row, new in beside_present(replace(case, present=weak))}
     assert float(rows["kc"][0]) == pytest.approx(weak.kc, rel=1e-3)
-    expected = analyse_loop(weak, in_loop(case, case.model.found.model))
+    expected = analyse_loop(weak, in_loop(case, case.model.model))
     assert float(rows["Ms"][0]) == pytest.approx(expected.ms, rel=1e-2)
     assert float(rows["Ms"][1]) == pytest.approx(case.best_gains.ms, rel=1e-2)
     assert "Beside the present gains" in read(page([replace(case, present=weak)])).text

@@ -14,7 +14,7 @@ from chromium import Chromium
 from served import HOSTILE, analysed, served, subject_of
 from tornado.websocket import websocket_connect
 
-from relay_autotune.report.case import model_case
+from relay_autotune.report.case import ultimate_of
 from relay_autotune.web import live as live_module
 from relay_autotune.web.live import Live, PageCommand
 from relay_autotune.web.wire import of_running
@@ -110,8 +110,8 @@ def test_only_what_is_possible_can_be_wished():
 
 def test_the_model_of_a_running_tune_lies_on_the_data_with_its_intervals():
     analysis = analysed()
-    model = model_case(analysis.model, None)
-    (gain, _) = model.ultimate
+    model = analysis.model
+    (gain, _) = ultimate_of(model)
     told = of_running(model, analysis.record, [(2, gain), (3, gain)])
     _, (times, drawn) = told["data"]
     record = analysis.record
