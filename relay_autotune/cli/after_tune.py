@@ -23,7 +23,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.cli.apply_gains import found_entries
@@ -82,9 +82,14 @@ from relay_autotune.record.record import Record
 from relay_autotune.text import digits, duration
 from relay_autotune.verdict import Verdict
 
+if TYPE_CHECKING:
+    from relay_autotune.result import Analysis
+
 CONTROLLER = "controller_node"
 # A loop may take this many settling times to come to rest, and at least a time [s].
 _TIMES_SETTLING, _REST_WITHIN = 5.0, 60.0
+# Relative difference of gains that are the same.
+_NEAR = 1e-6
 _UNFINISHED = "the proof did not end"
 _FAILED = "the step that was to prove them failed: {}"
 
@@ -166,9 +171,23 @@ class Tuned:
     def values(self) -> dict[str, Any]:
         """The parameters of the analysis by name: those of identifier_node, else the defaults."""
         # Imported here, because it loads slowly.
-        from relay_autotune.cli.report import defaults
+        from relay_autotune.analysis import PARAMETERS
 
-        return self.asked_there or defaults()
+        return self.asked_there or {entry.name: entry.default for entry in PARAMETERS}
+
+    def analysed(
+        self, tell: Callable[[str], None] = lambda _: None, *, alone: bool = False, **changed: Any
+    ) -> Analysis:
+        """Identify and tune as identifier_node does; once its parameters are known, in any thread.
+
+        :param tell: called with what begins.
+        :param alone: True: without the other methods and rules, which take most of the time.
+        :param changed: other values of parameters by name.
+        """
+        from relay_autotune.analysis import analyse, task_from
+
+        task = task_from(self.values | changed)
+        return analyse(self.record, **vars(task), tell=tell, alone=alone)
 
 
 class Proof:
@@ -389,7 +408,7 @@ class AfterTune(Tuned):
                 say(PROGRAM, f"{told} of {result.bag}" if result.bag else told)
             return "", ""
         # Imported here, because it loads slowly.
-        from relay_autotune.cli.report import flags_of, report_of_tune
+        from relay_autotune.cli.report import flags_of
 
         flags = flags_of(self.values)
         if not options.report:
@@ -397,11 +416,8 @@ class AfterTune(Tuned):
         try:
             if self.asked_there is None:
                 say(PROGRAM, "no identifier_node answers: the report uses its default parameters")
-            source = result.bag or self.loop.title
             with Working("writing the report"):
-                told = report_of_tune(
-                    self.record, self.values, result, source, options.report, self.loop.present()
-                )
+                told = self._write_report(flags)
         except RelayAutotuneError as error:
             say(PROGRAM, f"no report: {error}")
             return flags, ""
@@ -410,6 +426,29 @@ class AfterTune(Tuned):
         if not options.json:
             print(f"  {'report':<16} {options.report}")
         return flags, str(options.report)
+
+    def _write_report(self, flags: str) -> str:
+        """Write the report; return a warning where it has other gains than the tune, else ""."""
+        from relay_autotune.cli.report import write_report
+        from relay_autotune.report.case import case_of
+
+        result, output, present = self.result, self.options.report, self.loop.present()
+        found = self.analysed()
+        case = replace(case_of(found, result.bag or self.loop.title), present=present)
+        if result.bag:
+            again = f"report {shlex.quote(result.bag)} {flags}".rstrip()
+            if present is not None:
+                again += f" --present {present.kc:.6g} {present.ti:.6g} {present.td:.6g}"
+            case = replace(case, command=f"{again} -o {shlex.quote(output)}")
+        write_report([case], output)
+        gains, published = found.best_gains, result.gains
+        kc = gains.kc if gains is not None else math.nan
+        if not published.experiment_id or math.isclose(kc, published.kc, rel_tol=_NEAR):
+            return ""
+        return (
+            f"the report has kc {kc:.6g} where the identifier_node gave {published.kc:.6g}: "
+            "the node had other parameters, or is of another version"
+        )
 
     # The gains.
 
@@ -479,15 +518,11 @@ class AfterTune(Tuned):
 
     def _designed(self, law: str, against: str) -> _Written:
         """Design gains for the law of a program, from the record of the tune, and show them."""
-        # Imported here, because it loads slowly.
-        from relay_autotune.cli.report import analysed_as_there
-
         interval = f"{self.record.mean_interval:.3g}"
         what = f"time between two runs of {law} [s]"
         period = asked(what, "--sample-period", interval, "0.1", _positive)
         with Working(f"designing for {law}") as working:
-            asked_for = {**self.values, "law": law, "sample_period": period}
-            found = analysed_as_there(self.record, asked_for, working.at)
+            found = self.analysed(working.at, law=law, sample_period=period)
         gains = found.best_gains
         if gains is None:
             raise RelayAutotuneError(found.reason)

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from relay_autotune.analysis import PARAMETERS, analyse, task_from
+from relay_autotune.analysis import PARAMETERS
 from relay_autotune.cli.arguments import (
     DONE,
     NOTHING_FOUND,
@@ -33,10 +33,7 @@ from relay_autotune.cli.arguments import (
 from relay_autotune.cli.jobs import Job, add_analysis, analysed, jobs_of, present_of
 from relay_autotune.cli.terminal import Working
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
-from relay_autotune.loop.gains import Controller
-from relay_autotune.record.record import Record
 from relay_autotune.report import PICTURES, is_ours, write_figures, write_page, write_picture
-from relay_autotune.result import Analysis
 
 if TYPE_CHECKING:
     from relay_autotune.report.case import Case
@@ -253,9 +250,6 @@ def _cases(job: Job) -> list[Case]:
             say(PROGRAM, sentence)
 
 
-_NEAR = 1e-6
-
-
 def flags_of(values: Mapping[str, Any]) -> str:
     """Return the flags with which `replay` and `report` give the identifier_node's result.
 
@@ -272,64 +266,3 @@ def flags_of(values: Mapping[str, Any]) -> str:
             value = math.degrees(value)
         found += [flag_of(typed), f"{value:.12g}" if isinstance(value, float) else str(value)]
     return shlex.join(found)
-
-
-def analysed_as_there(
-    record: Record,
-    values: Mapping[str, Any],
-    tell: Callable[[str], None] = lambda _: None,
-    *,
-    alone: bool = False,
-) -> Analysis:
-    """Identify and tune as the identifier_node does.
-
-    :param record: the samples.
-    :param values: of its parameters, by name.
-    :param tell: called with what begins.
-    :param alone: True: without the other methods and rules, which take most of the time.
-    """
-    return analyse(record, **vars(task_from(values)), tell=tell, alone=alone)
-
-
-def defaults() -> dict[str, Any]:
-    """Return the default parameters of identifier_node, by name."""
-    return {entry.name: entry.default for entry in PARAMETERS}
-
-
-def report_of_tune(
-    record: Record,
-    values: Mapping[str, Any],
-    result: Any,
-    source: str,
-    output: str,
-    present: Controller | None = None,
-) -> str:
-    """Write a report of a tune.
-
-    :param record: its samples.
-    :param values: of the identifier_node's parameters, by name.
-    :param result: the `Tune.Result`.
-    :param source: name of the tune in the report.
-    :param output: file of the report.
-    :param present: the gains in force; None: not known.
-    :return: a warning for the user; empty: none.
-    :raises BagError: if it cannot be written.
-    """
-    from relay_autotune.report.case import case_of
-
-    found = analysed_as_there(record, values)
-    case = replace(case_of(found, source), present=present)
-    if result.bag:
-        again = f"report {shlex.quote(result.bag)} {flags_of(values)}".rstrip()
-        if present is not None:
-            again += f" --present {present.kc:.6g} {present.ti:.6g} {present.td:.6g}"
-        case = replace(case, command=f"{again} -o {shlex.quote(output)}")
-    write_report([case], output)
-    gains, published = found.best_gains, result.gains
-    kc = gains.kc if gains is not None else math.nan
-    if published.experiment_id and not math.isclose(kc, published.kc, rel_tol=_NEAR):
-        return (
-            f"the report has kc {kc:.6g} where the identifier_node gave {published.kc:.6g}: "
-            "the node had other parameters, or is of another version"
-        )
-    return ""

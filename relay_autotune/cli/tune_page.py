@@ -27,7 +27,7 @@ from relay_autotune.cli.apply_gains import found_entries, verified
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say, worst
 from relay_autotune.cli.loops import Loop
 from relay_autotune.cli.own_nodes import PROGRAM
-from relay_autotune.cli.report import analysed_as_there, flags_of
+from relay_autotune.cli.report import flags_of
 from relay_autotune.cli.terminal import UNITS
 from relay_autotune.cli.tune_view import (
     STATES,
@@ -365,12 +365,10 @@ class _LoopOnPage:
     def _add_subject(self, tune: Tuned) -> None:
         """Show the model of the tune, and let its gains be shaped; other rules come later."""
         try:
-            record, values = tune.record, tune.values
-            found = _awaited(
-                self._client,
-                self._page.slow.ask(partial(analysed_as_there, record, values, alone=True)),
-                lambda: bool(self._interrupted),
-            )
+            # Asked for here: the thread that computes handles no messages.
+            _, values = tune.record, tune.values
+            work = self._page.slow.ask(partial(tune.analysed, alone=True))
+            found = _awaited(self._client, work, lambda: bool(self._interrupted))
         except RelayAutotuneError as error:
             say(PROGRAM, f"the gains cannot be shaped: {error}")
             return
@@ -393,7 +391,7 @@ class _LoopOnPage:
         self._page.add(subject)
 
         def completed() -> None:
-            every = shown(analysed_as_there(record, values))
+            every = shown(tune.analysed())
             subject.case = replace(every, present=subject.case.present)
             self._page.changed()
 

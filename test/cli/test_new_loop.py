@@ -27,7 +27,7 @@ from rcl_interfaces.srv import SetParametersAtomically
 
 from relay_autotune import reasons as core
 from relay_autotune.bag.definitions import FLOAT64
-from relay_autotune.cli import loops, report, settings, terminal, tune_loop
+from relay_autotune.cli import loops, settings, terminal, tune_loop
 from relay_autotune.cli.after_tune import AfterTune
 from relay_autotune.cli.loops import Loop, TopicLoop
 from relay_autotune.cli.own_nodes import OwnNodes, namespace_of_joint, ros_arguments
@@ -773,14 +773,14 @@ def shown(
     nodes: Any = SimpleNamespace(why_lost=lambda: "")
     monkeypatch.chdir(tmp_path)
 
-    def analysed(_: Any, values: dict[str, Any], __: Any) -> Any:
-        asked = DesignOptions(law=values["law"], sample_period=values["sample_period"])
+    def analysed(_: Any, __: Any, **changed: Any) -> Any:
+        asked = DesignOptions(**changed)
         gains = design(DesignTask(model=process, options=asked), "imc")
         judgement = SimpleNamespace(reason="")
         return SimpleNamespace(best_gains=gains, verdict=Verdict.TRUSTED, judgement=judgement)
 
     # The whole analysis takes seconds.
-    monkeypatch.setattr(report, "analysed_as_there", analysed)
+    monkeypatch.setattr(AfterTune, "analysed", analysed)
 
     def show(
         passed: bool | None,

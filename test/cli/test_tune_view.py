@@ -10,16 +10,18 @@ import json
 import math
 import shlex
 from argparse import ArgumentParser
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from analysed import completed as analysed
 from report_cases import only
 
-from relay_autotune.analysis import Task, known_from, options_from
+from relay_autotune.analysis import PARAMETERS, Task, known_from, options_from
 from relay_autotune.cli import tune_loop
+from relay_autotune.cli.after_tune import AfterTune
 from relay_autotune.cli.jobs import add_analysis, jobs_of
-from relay_autotune.cli.report import defaults, flags_of, report_of_tune
+from relay_autotune.cli.report import flags_of
 from relay_autotune.cli.tune_view import (
     OUTCOMES,
     STATES,
@@ -41,6 +43,7 @@ from relay_autotune_msgs.msg import PidGains, RelayExperiment, TransferFunction
 from relay_autotune_msgs.msg import Reason as ReasonMessage
 
 NAN = math.nan
+DEFAULTS = {entry.name: entry.default for entry in PARAMETERS}
 
 
 def feedback(**values: Any) -> Any:
@@ -271,7 +274,7 @@ def test_a_result_has_model_gains_recording_and_what_to_type_next() -> None:
 
 
 def test_the_flags_of_the_next_command_give_what_the_identifier_was_asked_for() -> None:
-    assert flags_of(defaults()) == ""
+    assert flags_of(DEFAULTS) == ""
     told = {
         "method": "chang", "rule": "imc", "known_gain": 1.65, "known_dead_time": 0.5,
         "structure": "lag_n", "order": 3, "loss": "huber", "controller": "pi", "ms": 1.6,
@@ -279,8 +282,8 @@ def test_the_flags_of_the_next_command_give_what_the_identifier_was_asked_for() 
         "sample_period": 0.01, "loop_delay": 0.02, "noise_share": 0.2, "filter_ratio": 8.0,
         "closed_loop_time": 2.0, "phase_peak": math.radians(-130.0), "resonance": 3.0,
     }  # fmt: skip
-    assert set(told) == set(defaults())
-    values = defaults() | told
+    assert set(told) == set(DEFAULTS)
+    values = DEFAULTS | told
     parser = ArgumentParser()
     add_analysis(parser)
     (job,) = jobs_of(parser.parse_args(shlex.split(flags_of(values))), ["bag"])
@@ -289,19 +292,22 @@ def test_the_flags_of_the_next_command_give_what_the_identifier_was_asked_for() 
 
 def test_a_report_of_a_tune_is_what_the_identifier_would_say(monkeypatch, tmp_path) -> None:
     only(monkeypatch, "uncertainty")
-    monkeypatch.setattr("relay_autotune.cli.report.analyse", lambda record, **_: analysed())
     page = str(tmp_path / "page.html")
     tune = completed()
     tune.gains.kc = analysed().best_gains.kc
-    record = analysed().record
-    assert report_of_tune(record, defaults(), tune, "/records/x", page) == ""
+    present: list[Controller | None] = [None]
+    ended: Any = SimpleNamespace(
+        result=tune, options=SimpleNamespace(report=page), analysed=analysed,
+        loop=SimpleNamespace(present=lambda: present[0], title="x"),
+    )  # fmt: skip
+    assert AfterTune._write_report(ended, "") == ""
     told = (tmp_path / "page.html").read_text()
     assert "Gains to type in" in told
     assert f"report '{tune.bag}' -o {page}" in html.unescape(told)
     assert "Beside the present gains" not in told
     tune.gains.kc *= 1.1
-    before = Controller(0.1, 3.0)
-    assert "identifier_node gave" in report_of_tune(record, defaults(), tune, "x", page, before)
+    present[0] = Controller(0.1, 3.0)
+    assert "identifier_node gave" in AfterTune._write_report(ended, "")
     told = html.unescape((tmp_path / "page.html").read_text())
     assert f"report '{tune.bag}' --present 0.1 3 0 -o {page}" in told
     assert "Beside the present gains" in told
