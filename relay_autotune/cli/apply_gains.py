@@ -100,7 +100,7 @@ def _parser() -> argparse.ArgumentParser:
         "--wait", type=finite, default=REST_WITHIN, metavar="S",
         help="how long to wait until the loop is at rest [s] (%(default)s)",
     )  # fmt: skip
-    parser.set_defaults(stays=True)
+    parser.set_defaults(stays=True, question="Apply the new gains?")
     return parser
 
 
@@ -119,12 +119,13 @@ def _work(options: argparse.Namespace, graph: ExitStack) -> int:
 
 
 def apply_at(
-    name: str, beside: LoopClient, *, doubtful: bool, yes: bool, patience: float
+    name: str, beside: LoopClient, question: str, *, doubtful: bool, yes: bool, patience: float
 ) -> tuple[bool, str]:
     """Offer the newest gains to a controller_node that ends with this command.
 
     :param name: its full name.
     :param beside: a client of its loop.
+    :param question: with which they are applied without a step; empty: a step verifies them.
     :param doubtful: True: also gains whose verdict is not trusted.
     :param yes: True: do not ask.
     :param patience: how long to look for it [s].
@@ -134,6 +135,7 @@ def apply_at(
 
     options = _parser().parse_args(["--accept-doubtful"] if doubtful else [])
     options.yes, options.stays = yes, False
+    options.no_verify, options.question = bool(question), question
     with GainsClient("", name, beside) as client:
         # Who ends it also gives the set-point back, and says so.
         client.left_behind = ""
@@ -198,7 +200,8 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
         client.set_values(client.name, {"accept_doubtful": True})
     if options.no_verify:
         client.ask("apply")
-        print(f"  {'gains':<16} in force, not verified; {PROGRAM} --verify-only makes the step")
+        if options.stays:
+            tell("gains", f"in force, not verified; {PROGRAM} --verify-only makes the step")
         return True, ""
     new = None if options.verify_only else gains
     with noted(lambda text: say(PROGRAM, text)) as (shown, leave):
@@ -263,7 +266,7 @@ def _question(options: argparse.Namespace, step: float) -> str:
         steps.append(f"a step of the load by {options.load:g} u")
     what = "verify those in force" if options.verify_only else "apply the new gains"
     if options.no_verify:
-        return f"{what}?".capitalize()
+        return str(options.question)
     joined = " and ".join(steps)
     return (f"{what} with {joined}?" if options.verify_only else f"{what}, and verify them with "
             f"{joined}?").capitalize()  # fmt: skip

@@ -27,11 +27,10 @@ from relay_autotune.cli.own_nodes import (
     ros_arguments,
 )
 from relay_autotune.cli.settings import SETTING, Setting
-from relay_autotune.cli.table import beside
-from relay_autotune.cli.terminal import Working, agrees, tell, width
+from relay_autotune.cli.terminal import Working, tell
 from relay_autotune.errors import LoopError, SelectionError
 from relay_autotune.exchange.export import Target
-from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
+from relay_autotune.exchange.messages import gains_from_message
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.controller_manager import (
     ControllerManager,
@@ -40,7 +39,7 @@ from relay_autotune.nodes.controller_manager import (
     in_the_way,
     opened,
 )
-from relay_autotune.nodes.gains_place import gains_at, gains_text, put_gains
+from relay_autotune.nodes.gains_place import gains_at, gains_text
 from relay_autotune.nodes.joint_loop import COMMAND_TYPE, STATE_TYPE, joint_loop
 from relay_autotune.nodes.live_types import CommandMessage, message_class
 from relay_autotune.nodes.loop_client import GoneError, LoopClient
@@ -547,16 +546,18 @@ class JointLoop(Loop):
         if doubt and self.options.yes:
             say(PROGRAM, f"the gains are doubtful, so that --yes does not apply them: {doubt}")
             return None, ""
-        loop = self._loop
+        loop, question, before = self._loop, "", dict[str, float]()
         if loop.why_not_moved:
-            return self._set(), ""
+            question = f"Set {self._places} of {loop.node}, without a step that verifies them?"
+            before = self._robot.values(loop.node, list(loop.places.values()))
         self._start_controller()
         why_inactive = self._manager.still_active(loop.controller)
         self.client.why_lost = lambda: self.nodes.why_lost() or why_inactive()
         try:
-            return apply_at(
+            in_force, failed = apply_at(
                 f"{self.space}/controller_node",
                 self.client,
+                question,
                 doubtful=bool(doubt),
                 yes=self.options.yes,
                 patience=START_WITHIN,
@@ -565,6 +566,9 @@ class JointLoop(Loop):
             # It would have taken its step back.
             self.nodes.end("controller_node")
             raise GoneError(f"{error}; {self._put_back()}") from error
+        if in_force and question:
+            self._say_unverified(before)
+        return in_force, failed
 
     def _start_controller(self) -> None:
         """Start a controller_node that puts gains into the joint's controller and verifies them.
@@ -595,34 +599,24 @@ class JointLoop(Loop):
         self.nodes.end("controller_node")
         self.client.wait(lambda: not self.client.controllers(), _PATIENCE)
 
-    def _set(self) -> bool:
-        """Set the gains of a controller whose references nobody can move; return whether."""
-        loop, client = self._loop, self._robot
-        found = self.client.result
-        gains = gains_from_message(found.gains)
-        model = transfer_function_from_message(found.transfer_function)
-        before = client.values(loop.node, list(loop.places.values()))
-        wanted = {place: float(getattr(gains, name)) for name, place in loop.places.items()}
-        print("\n".join(beside(self.present(), gains, model, width())))
-        question = f"Set {self._places} of {loop.node}, without a step that verifies them?"
-        if not agrees(question, yes=self.options.yes):
-            say(PROGRAM, "nothing was changed")
-            return False
-        put_gains(client, loop.node, wanted, before)
+    def _say_unverified(self, before: dict[str, float]) -> None:
+        """Say which gains are in force without a step, and how to see what they do.
+
+        :param before: those before, by the names of their parameters.
+        """
+        loop = self._loop
+        now = self._robot.values(loop.node, list(before))
+        tell("gains", f"in force, read back: {gains_text(now)}; before: {gains_text(before)}")
         moved = f"move it by {loop.above[-1]}" if loop.above else "give it a short trajectory"
-        for label, text in (
-            ("gains", f"in force, read back: {gains_text(wanted)}; before: {gains_text(before)}"),
-            (
-                "not verified",
-                f"{loop.why_not_moved}: {moved}, and see in {loop.state_topic} that {loop.joint} "
-                f"follows",
-            ),
-        ):
-            tell(label, text)
+        tell(
+            "not verified",
+            f"{loop.why_not_moved}: {moved}, and see in {loop.state_topic} that {loop.joint} "
+            f"follows",
+        )
         if loop.follows:
             # In one line, so that it can be copied.
+            gains = gains_from_message(self.client.result.gains)
             print(f"  {self._short_trajectory(gains.settling_time)}")
-        return True
 
     def _short_trajectory(self, settling_time: float) -> str:
         """Return what to type for a small motion of the joint.

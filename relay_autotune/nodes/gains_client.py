@@ -31,7 +31,7 @@ from relay_autotune.exchange.messages import (
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.gains_place import gains_at, in_another_node, mapping_of, put_gains
+from relay_autotune.nodes.gains_place import gains_at, in_another_node, mapping_of
 from relay_autotune.nodes.loop_client import ANSWER_WITHIN, GoneError, LoopClient
 from relay_autotune.nodes.shell import prefix
 from relay_autotune.nodes.tables import FIXED, GAINS, rate_from, rate_of
@@ -287,8 +287,9 @@ class GainsClient(LoopClient):
         gains = ", ".join(f"{name} {value:.6g}" for name, value in before.items())
         with suppress(LoopError):
             if self.values(target, list(before)) != before:
-                put_gains(self, target, before, before)
-            return f"{target} has {gains}, as before{self.left_behind}"
+                self.set_values(target, before)
+            if self.values(target, list(before)) == before:
+                return f"{target} has {gains}, as before{self.left_behind}"
         return (
             f"{target} may have the new gains, which are not proven: start {self.name} again, "
             f"which brings {gains} back"

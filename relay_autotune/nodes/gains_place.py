@@ -102,31 +102,6 @@ def gains_at(client: LoopClient, node: str, places: Mapping[str, str]) -> Contro
     return controller_of(found) if found.get("kc", found.get("p")) != 0.0 else None
 
 
-def put_gains(
-    client: LoopClient, node: str, wanted: Mapping[str, float], before: Mapping[str, float]
-) -> None:
-    """Set the gains of a controller, all of them or none, and read them back.
-
-    :param client: a node of the graph.
-    :param node: full name of the controller's node.
-    :param wanted: the gains by the names of their parameters.
-    :param before: those in force, which are set again if others than the wanted are read.
-    :raises LoopError: if the controller does not have the wanted gains.
-    """
-    try:
-        client.set_values(node, wanted)
-        has = client.values(node, tuple(wanted))
-        if has != wanted:
-            raise LoopError(f"{node} has {gains_text(has)}, expected {gains_text(wanted)}")
-    except LoopError as error:
-        # An answer that is lost need not be a refusal.
-        try:
-            client.set_values(node, before)
-        except LoopError as left:
-            raise LoopError(f"{error}; and {left}: set {gains_text(before)} again") from None
-        raise LoopError(f"{error}; the gains are those of before: {gains_text(before)}") from None
-
-
 def gains_text(gains: Mapping[str, float]) -> str:
     """Return gains in words, by the last part of their parameters."""
     return ", ".join(f"{n.rpartition('.')[2]} {value:.6g}" for n, value in gains.items())

@@ -43,7 +43,6 @@ from relay_autotune.nodes.gains_place import (
     controller_of,
     in_another_node,
     mapping_of,
-    put_gains,
 )
 from relay_autotune.nodes.joint_loop import (
     TRAJECTORY_CONTROLLER,
@@ -196,47 +195,6 @@ def test_a_feedforward_is_a_weight_of_the_setpoint() -> None:
         law = found.law.running()
         wanted = 0.5 * (setpoint - measured) + 1.0 * 0.01 * (setpoint - measured) + 0.2 * setpoint
         assert law.step(setpoint, measured) == pytest.approx(wanted)
-
-
-class Taking:
-    """Stands for the client of a controller's node, which takes gains as it is told to."""
-
-    def __init__(self, *answers: str) -> None:
-        self.has, self._answers = {"g.p": 6.0, "g.i": 0.0}, list(answers)
-
-    def set_values(self, node, values):
-        answer = self._answers.pop(0)
-        if answer in ("takes", "answer lost"):
-            self.has = dict(values)
-        elif answer == "takes p alone":
-            self.has["g.p"] = values["g.p"]
-        if answer in ("answer lost", "refuses"):
-            raise LoopError(answer)
-
-    def values(self, node, names):
-        return {name: self.has[name] for name in names}
-
-
-@pytest.mark.parametrize(
-    ("answers", "told"),
-    [
-        (["takes"], ""),
-        (["refuses", "takes"], "refuses; the gains are those of before: p 6, i 0"),
-        (["answer lost", "takes"], "answer lost; the gains are those of before: p 6, i 0"),
-        (["takes p alone", "takes"], "/arm has p 2, i 0, expected p 2, i 1; the gains are those"),
-        (["answer lost", "refuses"], "answer lost; and refuses: set p 6, i 0 again"),
-    ],
-)
-def test_gains_are_set_all_or_none_and_those_before_come_back(answers, told) -> None:
-    client, wanted = Taking(*answers), {"g.p": 2.0, "g.i": 1.0}
-    before = dict(client.has)
-    if not told:
-        put_gains(client, "/arm", wanted, before)
-        assert client.has == wanted
-        return
-    with pytest.raises(LoopError, match=told):
-        put_gains(client, "/arm", wanted, before)
-    assert client.has == (wanted if "refuses: set" in told else before)
 
 
 @pytest.mark.parametrize(
