@@ -13,8 +13,13 @@ from sampled_relay import simulate_sampled_relay
 from worked_cases import cases
 
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.judgement.assessment import integrated_error, validate
+from relay_autotune.identification.judgement.assessment import (
+    integrated_error,
+    validate,
+    validate_fold,
+)
 from relay_autotune.identification.limit_cycle.fold import fold
+from relay_autotune.identification.limit_cycle.fourier import SteadyState
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import INTEGRATOR_INVERSE, UNSTABLE_FOPDT, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
@@ -47,6 +52,14 @@ def test_the_true_model_reproduces_its_record(model, relay):
     assert found.reason == ""
     assert found.worst < 0.02
     assert found.shape < 5e-3
+
+
+def test_a_relay_that_switches_below_the_rest():
+    """The model's run began at the rest, from which no rise reached the first level."""
+    relay = RelaySettings(5.0, 40.0, 1.0, 0.0, 0.1)
+    run = simulate_relay(FOPDT, relay, cycles=6, operating_point=5.5, kick=0.9, time=1200)
+    rest = SteadyState(5.5, 0.01, measured=True)
+    assert validate_fold(FOPDT, fold(run.record()), rest).worst < 0.02
 
 
 def test_a_thermostat_of_unknown_rest():

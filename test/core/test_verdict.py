@@ -8,14 +8,18 @@ from __future__ import annotations
 import math
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from analysed import completed, swing_check
+from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.analysis import Task, model_so_far
 from relay_autotune.errors import ParameterError
 from relay_autotune.identification.judgement.table import CHECKS, MODEL_CHECKS
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.result import Validation
+from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import RelaySettings
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Result, Verdict, judge, verdict_named
 
 
@@ -76,12 +80,23 @@ def test_a_running_experiment_is_not_judged():
     assert model_so_far(completed().record, task).verdict is Verdict.UNKNOWN
 
 
+def limit_cycle_evidence(
+    validation: Validation, *, away: bool = False, period: float = 0.01, noise_std: float = 0.0
+) -> SimpleNamespace:
+    """Return what the check of the limit cycle looks at, with a relay that sees samples alone."""
+    relay = RelaySettings(0.0, 0.0, 1.0, 0.0, 0.1)
+    noise = noise_std * np.random.default_rng(3).standard_normal(int(15.0 / period))
+    process = TransferFunction.fopdt(1.0, 1.0, 0.5)
+    record = simulate_sampled_relay(process, relay, period=period, noise=noise)
+    found = SimpleNamespace(validation=validation, began_away=away, friction=0.0)
+    return SimpleNamespace(found=found, settled=True, record=record)
+
+
 def test_a_model_without_limit_cycle_is_said_in_words_and_a_start_away_from_rest_comes_first():
     check = next(check for check in MODEL_CHECKS if check.name == "limit_cycle")
 
     def said(validation: Validation, *, away: bool = False) -> str:
-        found = SimpleNamespace(validation=validation, began_away=away, friction=0.0)
-        return check(SimpleNamespace(found=found, settled=True)).sentence
+        return check(limit_cycle_evidence(validation, away=away)).sentence
 
     none = Validation(reason="the measurement never reaches 6: there is no limit cycle")
     told = "the same relay on the model does not oscillate as recorded: the measurement never"
@@ -90,3 +105,12 @@ def test_a_model_without_limit_cycle_is_said_in_words_and_a_start_away_from_rest
     assert said(none, away=True).startswith("the test did not begin at rest")
     other = "the same relay on the model oscillates with a period 25.0 % shorter than the recorded"
     assert said(Validation(period=-0.25)) == f"{other} one"
+
+
+def test_a_period_that_scatters_does_not_speak_against_a_model():
+    """A relay that sees few samples switches late by chance."""
+    check = next(check for check in MODEL_CHECKS if check.name == "limit_cycle")
+    away = Validation(period=-0.12)
+    assert check(limit_cycle_evidence(away)).result is Result.DOUBTFUL
+    scattered = limit_cycle_evidence(away, period=0.25, noise_std=0.1)
+    assert check(scattered).result is Result.PASSED

@@ -163,7 +163,8 @@ def _limit_cycle(
     model: TransferFunction, settings: RelaySettings, rest: float, kick: float
 ) -> tuple[Cycle, FloatArray]:
     """Return the limit cycle of a model, and its curve from the switch to high on."""
-    kick = max(settings.hysteresis, kick)
+    # The relay may have switched below the rest, which no rise from there would reach.
+    kick = max(settings.hysteresis, kick + max(rest - settings.setpoint, 0.0))
     for count in _CYCLES:
         run = simulate_relay(
             model, settings, cycles=count, operating_point=rest, kick=kick, told=2

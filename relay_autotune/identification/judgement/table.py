@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.special import stdtrit
 
 from relay_autotune.identification.judgement.assessment import unexplained_share
 from relay_autotune.identification.judgement.checks import (
@@ -21,6 +22,7 @@ from relay_autotune.identification.judgement.checks import (
 )
 from relay_autotune.identification.judgement.difference import LEAST_SAMPLES
 from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence
+from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.text import digits
 from relay_autotune.verdict import Check, Measured, not_known
 
@@ -55,11 +57,17 @@ def _limit_cycle(evidence: Evidence) -> Measured | None:
     if validation is None or not evidence.settled or evidence.found.friction:
         # The same relay on the model alone moves without the friction.
         return None
-    away = abs(validation.period)
-    than = "longer" if validation.period > 0.0 else "shorter"
-    said = f"oscillates with a period {digits(100.0 * away, 3)} % {than} than the recorded one"
     if validation.reason:
         away, said = math.inf, f"does not oscillate as recorded: {validation.reason}"
+    else:
+        seen = limit_cycle(evidence.record)
+        count = len(seen.cycles)
+        scatter = stdtrit(max(count - 1, 1), 0.975) * seen.std["period"] / math.sqrt(count)
+        # What the scatter of the recorded periods does not explain.
+        away = max(abs(validation.period) - float(scatter) / seen.period, 0.0)
+        than = "longer" if validation.period > 0.0 else "shorter"
+        part = digits(100.0 * abs(validation.period), 3)
+        said = f"oscillates with a period {part} % {than} than the recorded one"
     first = ""
     if evidence.found.began_away:
         first = "the test did not begin at rest, so that the baseline may be wrong, and "
@@ -221,8 +229,8 @@ MODEL_CHECKS = (
     Check(
         name="limit_cycle",
         title="Limit cycle",
-        what="period of the limit cycle that the same relay makes with the model, relative to the "
-        "recorded one",
+        what="how far the period of the limit cycle that the same relay makes with the model is "
+        "from the recorded one for certain, as a part of that",
         unit="",
         doubtful=0.1,
         sentence="{detail}",
