@@ -221,7 +221,7 @@ class Proof:
         # How long the loop takes to settle with the gains, and all of it [s].
         known = math.isfinite(gains.settling_time)
         self._settles = gains.settling_time if known else wanted.duration
-        self._takes = wanted.duration + 2.0 * self._settles
+        self._takes = wanted.duration + 2.5 * self._settles
         self._expected = choice.expected(wanted)
 
     @property

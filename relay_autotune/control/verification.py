@@ -35,6 +35,8 @@ GAIN_RANGE = (0.6, 1.7)
 MS_RATIO = 1.3
 # Allowance for noise in each comparison, in standard deviations.
 NOISE_ALLOWANCE = 3.0
+# By so many standard deviations the largest of some six samples about a peak is above it.
+_AT_PEAK = 1.27
 # A deviation this many times the largest predicted one ends the step at once.
 RUNAWAY = 3.0
 
@@ -323,15 +325,15 @@ def describe(
     :param noise_std: standard deviation of the noise, which does not count as error [y].
     """
     error = step.setpoint - deviation
-    allowed = NOISE_ALLOWANCE * noise_std
+    allowed, at_peak = NOISE_ALLOWANCE * noise_std, _AT_PEAK * noise_std
     if step.setpoint != 0.0:
         way = deviation / step.setpoint
-        overshoot = max(0.0, float(way.max()) - 1.0 - allowed / abs(step.setpoint))
+        overshoot = max(0.0, float(way.max()) - 1.0 - at_peak / abs(step.setpoint))
         band = SETTLED * abs(step.setpoint) + allowed
     else:
         side = 1.0 if deviation.max() >= -deviation.min() else -1.0
         top, other = float((side * deviation).max()), float((-side * deviation).max())
-        overshoot = max(0.0, other - allowed) / top if top > 0.0 else 0.0
+        overshoot = max(0.0, other - at_peak) / top if top > 0.0 else 0.0
         band = SETTLED * top + allowed
     outside = np.flatnonzero(np.abs(error) > band)
     settled = 0 if outside.size == 0 else min(int(outside[-1]) + 1, time.size - 1)
@@ -394,7 +396,8 @@ def compare(
     size = float(np.linalg.norm(slope))
     unsure = NOISE_ALLOWANCE * ratio * noise_std / size if size > 0.0 else 0.0
     ms, ms_predicted = _ms(control, scaled(model, ratio)), _ms(control, model)
-    compared = _comparisons(measured, expected, ratio, ms, ms_predicted, time)
+    spared = (NOISE_ALLOWANCE - _AT_PEAK) * noise_std / (abs(step.setpoint) or expected.largest)
+    compared = _comparisons(measured, expected, spared, ratio, ms, ms_predicted, time)
     # Written so that NaN does not pass.
     problems = [c.problem for c in compared if not c.taken <= 1.0]
     narrow = [c.numbers for c in compared if c.taken > _NARROW]
@@ -456,12 +459,13 @@ class _Compared:
 def _comparisons(
     measured: Response,
     expected: Response,
+    spared: float,
     ratio: float,
     ms: float,
     ms_predicted: float,
     time: FloatArray,
 ) -> tuple[_Compared, ...]:
-    overshoot = expected.overshoot + OVERSHOOT_MARGIN
+    overshoot = expected.overshoot + OVERSHOOT_MARGIN + spared
     settling = SETTLING_RATIO * expected.settling_time + 2.0 * float(np.median(np.diff(time)))
     settled = measured.settling_time < float(time[-1] - time[0])
     iae, least, most = IAE_RATIO * expected.iae, *GAIN_RANGE

@@ -39,6 +39,9 @@ _BEFORE = 50
 _LEAST_BEFORE = 10
 # A loop at rest moves by less than this part of a step.
 _STILL = 0.1
+# After a tune the loop begins up to twice the step away from rest, and what is left of that after
+# the settling time of a step changed the gain that the next step shows by a tenth: settling times.
+_SETTLES = 1.5
 # Longest silence of the measurement: a time [s], or a number of usual intervals if that is longer.
 _SILENCE = 2.0
 _SILENT_INTERVALS = 20.0
@@ -281,7 +284,8 @@ class Verifier:
             await self._on_trial(tried)
             self._require_on()
             shown = self._recent[-1][0] - self._recent[0][0]
-            await self._settled(tried.settles if math.isfinite(tried.settles) else shown)
+            settles = tried.settles if math.isfinite(tried.settles) else shown
+            await self._settled(_SETTLES * settles)
         until = time.monotonic() + request.patience
         rest, period = await self._once_ready(lambda: self._at_rest(tried.steps), until)
         loop, noise = (tried.control, tried.model), rest.noise_std
