@@ -39,6 +39,8 @@ _BEFORE = 50
 _LEAST_BEFORE = 10
 # A loop at rest moves by less than this part of a step.
 _STILL = 0.1
+# Slow noise moves the mean of a few samples by this many standard deviations at most.
+_SLOW_NOISE = 4.0
 # After a tune the loop begins up to twice the step away from rest, and what is left of that after
 # the settling time of a step changed the gain that the next step shows by a tenth: settling times.
 _SETTLES = 1.5
@@ -286,8 +288,11 @@ class Verifier:
             shown = self._recent[-1][0] - self._recent[0][0]
             settles = tried.settles if math.isfinite(tried.settles) else shown
             await self._settled(_SETTLES * settles)
-        until = time.monotonic() + request.patience
-        rest, period = await self._once_ready(lambda: self._at_rest(tried.steps), until)
+        begun, patience = time.monotonic(), request.patience
+        rest, period = await self._once_ready(
+            lambda: self._at_rest(tried.steps, time.monotonic() - begun < 0.5 * patience),
+            begun + patience,
+        )
         loop, noise = (tried.control, tried.model), rest.noise_std
         plans = await self._computed(lambda: [plan(*loop, s, period, noise) for s in tried.steps])
         for step, planned in zip(tried.steps, plans, strict=True):
@@ -404,8 +409,13 @@ class Verifier:
         theirs = self._recent[-1][0] - self._recent[0][0]
         return ours / theirs if theirs > 0.0 else 1.0
 
-    def _at_rest(self, steps: Sequence[Step]) -> tuple[Rest, float]:
-        """Return the loop's state of rest and its sample period [s]."""
+    def _at_rest(self, steps: Sequence[Step], may_settle: bool) -> tuple[Rest, float]:
+        """Return the loop's state of rest and its sample period [s].
+
+        :param steps: that are to be made.
+        :param may_settle: True: a slow movement may be the rest of a transient; False: after so
+            long it is the noise of this loop.
+        """
         self._require_samples()
         t, y, u = np.transpose(self._recent)
         period = float(np.median(np.diff(t)))
@@ -414,6 +424,8 @@ class Verifier:
         found = rest_state(t - t[0], y, len(t))
         smallest = min((abs(s.setpoint) for s in steps if s.setpoint), default=math.inf)
         moved, by_noise = slow_movement(y)
+        if not may_settle:
+            by_noise = _SLOW_NOISE * found.noise_std
         # What is left of a transient shifts the rest, and would count as noise.
         if moved > max(by_noise, _STILL * smallest):
             raise NotReadyError(Code.NOT_AT_REST(drift=moved, samples=len(self._recent)))

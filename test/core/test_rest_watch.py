@@ -9,11 +9,12 @@ import re
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.phases import State
-from relay_autotune.experiment.settling import RestWatch, slow_movement
+from relay_autotune.experiment.settling import RestWatch, rest_state, slow_movement
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import Outcome
@@ -129,3 +130,14 @@ def test_white_noise_is_at_rest_wherever_it_is(samples):
     at_rest = [np.less_equal(*slow_movement(20.0 + 3.0 * n)) for n in noise]
     assert np.mean(at_rest) > 0.99
     assert slow_movement(np.full(samples, 0.1))[0] == pytest.approx(0.0, abs=1e-15)
+
+
+def test_slow_noise_is_told_by_its_scatter_about_a_line():
+    """By white noise alone a loop with slow noise would never be at rest."""
+    white = np.random.default_rng(5).standard_normal((400, 150))
+    slow = lfilter([1.0], [1.0, -0.9], white)[:, 100:]
+    samples = np.arange(50.0)
+    moved, allowed = np.transpose([slow_movement(y) for y in slow])
+    assert np.mean(moved > allowed) > 0.9
+    scatter = np.array([rest_state(samples, y, 50).noise_std for y in slow])
+    assert np.mean(moved < 4.0 * scatter) > 0.8
