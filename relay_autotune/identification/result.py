@@ -218,6 +218,8 @@ class Identification:
     began_away: bool = False
     # True: a step of the load was estimated with the model.
     loaded: bool = False
+    # Play between command and process that was estimated with the model [u]; 0: none.
+    play: float = 0.0
     # Dry friction that was estimated with the model, as a command [u]; 0: none.
     friction: float = 0.0
     # Standard deviation of the measurement beside drift, past and load, which the model has to

@@ -51,6 +51,7 @@ UNTOLD = {
         for name in (
             "fitted",
             "effects",
+            "play",
             "friction",
             "began_away",
             "loaded",

@@ -326,7 +326,8 @@ def _felt(settings: RelaySettings, found: Identification, first: float) -> Relay
     """Return the relay whose equal effects are those that a process feels of one."""
     low, high = found.felt(np.array([settings.low, settings.high]), first).tolist()
     bias = 0.5 * (high + low) - settings.baseline
-    return replace(settings, amplitude=0.5 * (high - low), bias=bias)
+    # Each of its moves crosses the play.
+    return replace(settings, amplitude=0.5 * (high - low - found.play), bias=bias)
 
 
 def _error_from(reference: Identification, found: Identification) -> float:

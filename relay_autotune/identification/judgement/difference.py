@@ -78,11 +78,14 @@ def widened(found: Identification, beside: Difference | None) -> Identification:
     """Return a model whose intervals of K_u and w_u hold what the record shows beside it.
 
     To the variances over the models those are added of the logarithms of the ratios that the
-    ultimate points of the model with each draw of the difference have to its own.
+    ultimate points of the model with each draw of the difference have to its own, and that of
+    the unequal effects of commands, with which K_u differs from side to side.
 
     :param found: the model, with the intervals of models alone.
     :param beside: what the record shows beside it; None: it cannot tell.
     """
+    sides = abs(found.ultimate_gain) * 0.5 * abs(found.effects[0] - found.effects[1])
+    found = replace(found, ultimate_gain_std=math.hypot(found.ultimate_gain_std, sides))
     if beside is None or not math.isfinite(found.ultimate_gain_std):
         return found
     model, own = found.model, found.ultimate_frequency

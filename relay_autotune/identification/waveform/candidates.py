@@ -65,7 +65,7 @@ _SAMPLES_EACH = 8
 # Least number of moves of a command that tell whether one came before the record.
 _MANY = 6
 # What may be estimated beside the model, as fields of a problem.
-TERMS = ("drift", "relaxation", "past", "unequal", "load", "friction")
+TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "friction")
 # Those of what went on before the record, for which a dead time can stand.
 _BEFORE = frozenset(("drift", "relaxation", "past"))
 # Steps of a fit with a further term or in another colour; instants at which a load is tried, and
@@ -200,6 +200,14 @@ class FitContext:
         return 1 if self.fopdt.coefficients[0] > 0.0 else -1
 
     @cached_property
+    def least_friction(self) -> float:
+        """Least dry friction or play that counts [u]; infinite for ramps, which show neither."""
+        u = self.problem.inputs[0]
+        if not isinstance(u, PiecewiseConstant):
+            return math.inf
+        return _LEAST_FRICTION * float(np.ptp(u.values))
+
+    @cached_property
     def pushed(self) -> float:
         """Longest time for which the command acted in one direction [s]; infinite for a relay."""
         if self.sign:
@@ -229,12 +237,12 @@ class FitContext:
         if min(problem.effects(state.coefficients)) < 0.0:
             # Commands may lose their effect on one side, but not act the other way there.
             return None
-        if problem.friction:
-            u = problem.inputs[0]
-            assert isinstance(u, PiecewiseConstant)
-            least = _LEAST_FRICTION * float(np.ptp(u.values))
-            if problem.dry_friction(state.coefficients) < least:
-                return None
+        if problem.friction and problem.dry_friction(state.coefficients) < self.least_friction:
+            return None
+        if problem.play and not (
+            self.least_friction <= problem.play_of(state.coefficients) <= problem.most_play
+        ):
+            return None
         shortest, _ = time_scales(self.problem)
         if is_unobservable(model, shortest, self.length, self.pushed):
             return None
@@ -324,6 +332,7 @@ class FitContext:
             "relaxation": not rested,
             "past": not rested and self.problem.past_is_open,
             "unequal": self.problem.acts_both_ways,
+            "play": self.problem.most_play >= self.least_friction,
             # Between a few steps, a load cannot be told from a slow disturbance.
             "load": self.held and len(self.problem.bounds) == 1,
             "friction": self.held and bool(self.problem.motions),

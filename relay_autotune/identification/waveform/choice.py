@@ -154,8 +154,7 @@ def responds(problem: Problem, state: Trial, evidence: float = 0.0) -> bool:
     :param evidence: by how much more, in units of the score.
     """
     n, floor = problem.y.size, problem.y.size * NEGLIGIBLE**2
-    beside = replace(problem, unequal=False)
-    nuisance = beside.seen(beside.columns(state.theta)[0][len(problem.structure.powers) :])
+    nuisance = problem.nuisances(state.theta)
     left = left_of(problem.seen(problem.y), nuisance)
     without = information_criterion(float(left @ left), n, nuisance.shape[0], floor)
     return information_criterion(state.cost, n, state.parameters, floor) < without - evidence

@@ -42,7 +42,7 @@ from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Problem,
     Trial,
-    left_of,
+    left_in_simulation,
     refine,
 )
 from relay_autotune.process.transfer_function import TransferFunction
@@ -118,8 +118,9 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         effects=problem.effects(state.coefficients),
         began_away=_began_away(records, fit),
         loaded=problem.load is not None,
+        play=problem.play_of(state.coefficients),
         friction=problem.dry_friction(state.coefficients),
-        to_explain=scale * _spread_beside(problem, state),
+        to_explain=scale * left_in_simulation(problem, state)[1],
     )
     apart = f"{math.sqrt(allowed.temper):.2g}"
     if float(apart) > 1.0:
@@ -148,14 +149,6 @@ def point_stds(found: Identification, mixture: Sequence[TransferFunction]) -> tu
         return math.nan, math.nan
     gain_std, frequency_std = np.abs(own) * np.sqrt(np.mean(np.log(ratios) ** 2, axis=0))
     return float(gain_std), float(frequency_std)
-
-
-def _spread_beside(problem: Problem, state: Trial) -> float:
-    """Return the standard deviation of the samples beside the terms that are no response."""
-    plain = replace(problem, unequal=False, colour=None)
-    rows = plain.seen(plain.columns(state.theta)[0][len(problem.structure.powers) :])
-    left = left_of(plain.seen(plain.y), rows)
-    return math.sqrt(float(np.mean(left**2)))
 
 
 def _frequency(fit: Fit) -> float:
@@ -292,6 +285,13 @@ def _warnings(
             f"commands above the first one act {above:.2f} times as strongly as in the model, "
             f"those below it {below:.2f} times: the process is not linear, and the gains hold on "
             "both sides; the weaker direction sets how fast the loop can be"
+        )
+    if fit.problem.play:
+        play = fit.problem.play_of(fit.state.coefficients)
+        found.append(
+            f"play of {play:.3g} u was estimated with the model: after each reversal of the "
+            "command the process first feels nothing of it; gains are for moves beyond it, and "
+            "the loop may circle slowly within it"
         )
     if fit.problem.friction:
         friction = fit.problem.dry_friction(fit.state.coefficients)

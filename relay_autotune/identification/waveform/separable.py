@@ -71,6 +71,7 @@ class Problem:
     :param past: True: the command before each experiment is estimated: the process rested, or
         moved freely, under another level than its first one.
     :param unequal: True: commands above and below the first one have effects of their own.
+    :param play: True: play between command and process is estimated, which delays each reversal.
     :param load: when a step of the load came, in the first experiment [s]; its size and a small
         shift of its time are estimated. None: none came.
     :param friction: True: dry friction is estimated: a command against each motion, and what it
@@ -91,6 +92,7 @@ class Problem:
     weight: FloatArray | None = None
     past: bool = False
     unequal: bool = False
+    play: bool = False
     load: float | None = None
     friction: bool = False
     motions: tuple[PiecewiseConstant, ...] = ()
@@ -124,6 +126,18 @@ class Problem:
             for u, part in zip(self.inputs, self.experiments, strict=True)
         )
 
+    @cached_property
+    def most_play(self) -> float:
+        """Largest play that the commands show [u]; 0: they show none.
+
+        Each command has to come to one level from above and from below: between two levels alone,
+        play only makes the moves smaller, as a smaller gain does. And all moves have to cross it.
+        """
+        return min(
+            _shown_play(u, self.time[part])
+            for u, part in zip(self.inputs, self.experiments, strict=True)
+        )
+
     @property
     def _further(self) -> tuple[str, ...]:
         """What has responses of its own after the model's, a name for each, in their order."""
@@ -131,6 +145,7 @@ class Problem:
             "friction": 2 * self.friction,
             "past": int(self.past),
             "unequal": int(self.unequal),
+            "play": int(self.play),
             "load": 2 * (self.load is not None),
         }
         return tuple(name for name, count in counts.items() for _ in range(count))
@@ -138,8 +153,8 @@ class Problem:
     def places(self, term: str) -> list[int]:
         """Return where each input of a term has its first coefficient, from the end of all.
 
-        :param term: ``friction``, ``past``, ``unequal`` or ``load``; of several experiments the
-            last one has these places.
+        :param term: one of the names in `_further`; of several experiments the last one has these
+            places.
         """
         count, lines = len(self.structure.powers), len(self.bounds) * (1 + self.drift)
         names = self._further
@@ -160,6 +175,13 @@ class Problem:
         """
         share = self.relative("unequal", coefficients) if self.unequal else 0.0
         return 1.0 + share, 1.0 - share
+
+    def play_of(self, coefficients: FloatArray) -> float:
+        """Return the command that a reversal loses in the play [u]; 0: not estimated.
+
+        :param coefficients: of a fit, shape (k,).
+        """
+        return -2.0 * self.relative("play", coefficients) if self.play else 0.0
 
     def dry_friction(self, coefficients: FloatArray) -> float:
         """Return the command that dry friction takes from each motion [u]; 0: not estimated.
@@ -211,6 +233,14 @@ class Problem:
             first, last = place.stop, last + rest.shape[0]
         return every, derivatives
 
+    def nuisances(self, theta: FloatArray) -> FloatArray:
+        """Return the columns that are no response to the command, as seen, shape (p, n).
+
+        :param theta: shape (m,).
+        """
+        beside = replace(self, unequal=False, play=False)
+        return self.seen(beside.columns(theta)[0][len(self.structure.powers) :])
+
     def _of_one(
         self, theta: FloatArray, part: slice, number: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -243,6 +273,8 @@ class Problem:
             found.append(pulse(float(self.time[self.experiments[number]][0])))
         if self.unequal:
             found.append(_folded(self.inputs[number]))
+        if self.play:
+            found.append(_turns(self.inputs[number]))
         if self.load is not None:
             found += [pulse(self.load, length) for length in (math.inf, self.shortest)]
         return found
@@ -323,6 +355,32 @@ def _folded(u: Input) -> PiecewiseConstant:
     """Return the distance of a held command from its first level."""
     assert isinstance(u, PiecewiseConstant)
     return PiecewiseConstant(u.times, np.abs(u.values - u.initial), 0.0)
+
+
+def _turns(u: Input) -> PiecewiseConstant:
+    """Return the direction of a held command's last move, 1 or -1, and 0 before the first.
+
+    Behind a play that every move crosses, a process feels the command less half of the play in
+    that direction.
+    """
+    assert isinstance(u, PiecewiseConstant)
+    moves = np.sign(np.diff(u.values, prepend=u.initial))
+    moved = moves != 0.0
+    return PiecewiseConstant(u.times[moved], moves[moved], 0.0)
+
+
+def _shown_play(u: Input, time: FloatArray) -> float:
+    """Return the least way of a command between two turns, where that shows a play [u]; or 0."""
+    if not isinstance(u, PiecewiseConstant):
+        return 0.0
+    turns = _turns(u)
+    # Of the last move little is seen.
+    times = turns.times[(turns.times >= time[0]) & (turns.times < time[-1])][:-1]
+    level, direction = u(times), turns(times)
+    if not np.intersect1d(level[direction > 0.0], level[direction < 0.0]).size:
+        return 0.0
+    ends = level[np.append(np.diff(direction) != 0.0, True)]
+    return float(np.abs(np.diff(ends, prepend=u.initial)).min())
 
 
 def problem_of(
@@ -435,10 +493,10 @@ def left_in_simulation(problem: Problem, state: Trial) -> tuple[float, float]:
     :param problem: may hold other samples than those that the model was fitted to.
     :param state: the model.
     """
-    problem, own = replace(problem, colour=None), len(problem.structure.powers)
-    columns, y = problem.seen(problem.columns(state.theta)[0]), problem.seen(problem.y)
-    response = state.coefficients[:own] @ columns[:own]
-    left, total = left_of(y - response, columns[own:]), left_of(y, columns[own:])
+    problem = replace(problem, colour=None)
+    y, nuisances = problem.seen(problem.y), problem.nuisances(state.theta)
+    modelled = state.coefficients @ problem.seen(problem.columns(state.theta)[0])
+    left, total = left_of(y - modelled, nuisances), left_of(y, nuisances)
     return math.sqrt(float(np.mean(left**2))), math.sqrt(float(np.mean(total**2)))
 
 
