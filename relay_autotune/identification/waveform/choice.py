@@ -61,13 +61,16 @@ NO_RESPONSE = (
     "record longer, or check that both topics belong to one loop"
 )
 # Order in which structures are fitted: first those that show which others are hopeless.
-_TRIED = (
-    *(FOPDT, SOPDT, LAG_N, THREE_LAGS, TWO_EQUAL_ONE, LAG_N_ZERO, SOPDT_ZERO),
-    *(IPDT, INTEGRATOR_LAG, INTEGRATOR_INVERSE, UNSTABLE_FOPDT, UNSTABLE_SOPDT),
+TRIED = tuple(
+    structure.name
+    for structure in (
+        *(FOPDT, SOPDT, LAG_N, THREE_LAGS, TWO_EQUAL_ONE, LAG_N_ZERO, SOPDT_ZERO),
+        *(IPDT, INTEGRATOR_LAG, INTEGRATOR_INVERSE, UNSTABLE_FOPDT, UNSTABLE_SOPDT),
+    )
 )
 # By these it is decided what is estimated beside the model: a command off the balance of an
 # integrator looks like a drift.
-_SIMPLE = (FOPDT.name, SOPDT.name, IPDT.name)
+SIMPLE = (FOPDT.name, SOPDT.name, IPDT.name)
 # Gains have to hold on the models of these, too.
 PLAIN = (FOPDT.name, SOPDT.name)
 # Numbers of samples, and samples for each response of the process. More correlated samples tell
@@ -77,8 +80,8 @@ _A_RESPONSE = 5.0
 # In white noise every sample tells something; more than these change no choice.
 _MOST_WHITE = 16_384
 _MOST_TIMES = 4
-# Score beyond which a structure is not tried in the next colour: odds of e^15. The plain ones
-# always are: gains have to hold on their models, too.
+# Score beyond which a structure is hopeless beside the best one: odds of e^15. The plain ones
+# never are: gains have to hold on their models, too.
 _HOPELESS = 30.0
 # Length of the record in correlation times of the slow disturbance that is tried first.
 _SLOWEST = 10.0
@@ -93,7 +96,15 @@ _INDIFFERENT = 2.0
 _WORSE = 6.0
 
 
-def chosen_fit(problem: Problem, known: Known, sign: int, scale: float, *, held: bool) -> Fit:
+def chosen_fit(
+    problem: Problem,
+    known: Known,
+    sign: int,
+    scale: float,
+    *,
+    held: bool,
+    among: Sequence[str] = TRIED,
+) -> Fit:
     """Return the fit of the best structure, in the colour of its noise.
 
     :param problem: samples and input, with a FOPDT structure.
@@ -101,10 +112,11 @@ def chosen_fit(problem: Problem, known: Known, sign: int, scale: float, *, held:
     :param sign: direction of the relay, 1 or -1; 0: not known.
     :param scale: range of the measurement [y].
     :param held: True: a relay held the process, so that it may be unstable.
+    :param among: names of the structures, where none is known.
     :raises IdentificationError: if no structure explains the record.
     """
     few = _dense_enough(problem, sign, held)
-    found = _compared(few, known)
+    found = _compared(few, known, among)
     dense = problem.thinned(_MOST_WHITE)
     if found and dense.time.size > few.problem.time.size:
         found = _on_more_samples(replace(few, problem=dense), found)
@@ -174,17 +186,17 @@ def _dense_enough(problem: Problem, sign: int, held: bool) -> FitContext:
     return FitContext.of(more, sign, held=held)
 
 
-def _compared(context: FitContext, known: Known) -> list[Candidate]:
+def _compared(context: FitContext, known: Known, among: Sequence[str] = TRIED) -> list[Candidate]:
     """Return all structures in one colour, the best first.
 
     What is estimated beside the model is decided with a few simple structures, and again with
     the best one of all.
     """
-    names = [known.structure] if known.structure else [s.name for s in _TRIED]
-    if not context.held and not known.structure:
-        # What runs away by itself is not recorded, except where a relay held it.
-        names = [s.name for s in _TRIED if not s.unstable]
-    first = (*_SIMPLE, INTEGRATOR_LAG.name) if context.problem.motions else _SIMPLE
+    # What runs away by itself is not recorded, except where a relay held it.
+    names = [n for n in among if context.held or not TABLE[n].unstable]
+    if known.structure:
+        names = [known.structure]
+    first = (*SIMPLE, INTEGRATOR_LAG.name) if context.problem.motions else SIMPLE
     simple = context.fit(names if known.structure else first, known.order)
     if not simple:
         return []
@@ -296,8 +308,7 @@ def _converged(found: list[Candidate], context: FitContext) -> list[Candidate]:
         if not found:
             return []
         best = found[0]
-        near = [c for c in found if c.score <= best.score + _HOPELESS or c.structure.name in PLAIN]
-        found = _in(_colour(best.problem, best.state), near, context)
+        found = _in(_colour(best.problem, best.state), _near(found), context)
         if found and found[0].structure == best.structure:
             scale = unit_steps(best.structure, best.state.theta)
             change = np.abs(found[0].state.theta - best.state.theta) / scale
@@ -306,10 +317,31 @@ def _converged(found: list[Candidate], context: FitContext) -> list[Candidate]:
     return found
 
 
+def _near(found: Sequence[Candidate]) -> list[Candidate]:
+    """Return the candidates that are not hopeless."""
+    most = min(c.score for c in found) + _HOPELESS
+    return [c for c in found if c.score <= most or c.structure.name in PLAIN]
+
+
+def names_near(fit: Fit) -> list[str]:
+    """Return the names of the structures that are not hopeless beside a chosen one.
+
+    :param fit: with its candidates.
+    """
+    return list(dict.fromkeys(c.structure.name for c in _near(fit.candidates)))
+
+
 def _in(colour: Colour | None, found: list[Candidate], context: FitContext) -> list[Candidate]:
     """Return candidates fitted in one colour, the best first."""
-    again = (context.refit(c, colour, STEPS) for c in found)
-    return sorted((c for c in again if c is not None), key=lambda c: c.score)
+    again: list[Candidate] = []
+    most = math.inf
+    for candidate in sorted(found, key=lambda c: c.score):
+        plain = candidate.structure.name in PLAIN
+        fitted = context.refit(candidate, colour, STEPS, math.inf if plain else most)
+        if fitted is not None:
+            again.append(fitted)
+            most = min(most, fitted.score + _HOPELESS)
+    return sorted(again, key=lambda c: c.score)
 
 
 def _colour(problem: Problem, state: Trial) -> Colour | None:

@@ -25,7 +25,12 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.waveform.choice import chosen_fit
+from relay_autotune.identification.waveform.choice import (
+    SIMPLE,
+    TRIED,
+    chosen_fit,
+    names_near,
+)
 from relay_autotune.identification.waveform.findings import report
 from relay_autotune.identification.waveform.fit_covariance import (
     Fit,
@@ -67,6 +72,9 @@ _ALIKE = 1.2
 _MOST_ROUNDS = 20
 _STEADY = 0.02
 _LEAST_NOISE = 1e-3
+
+# Fits samples with the best of all structures, or of those that are named.
+Choose = Callable[..., Fit]
 
 
 def identify_waveform(record: Record, known: Known = NOTHING) -> Identification:
@@ -127,8 +135,8 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
 def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held: bool) -> Fit:
     """Fit, again with each experiment weighted by its noise, and again without spikes."""
 
-    def chosen(samples: Problem) -> Fit:
-        return chosen_fit(samples, known, sign, scale, held=held)
+    def chosen(samples: Problem, among: Sequence[str] = TRIED) -> Fit:
+        return chosen_fit(samples, known, sign, scale, held=held, among=among)
 
     stopped = ""
     if not sign and len(problem.bounds) == 1:
@@ -139,7 +147,7 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
     return replace(fit, warnings=(*fit.warnings, stopped)) if stopped else fit
 
 
-def _before_stop(problem: Problem, chosen: Callable[[Problem], Fit]) -> tuple[Problem, str]:
+def _before_stop(problem: Problem, chosen: Choose) -> tuple[Problem, str]:
     """Return the samples before a stop or the end of a sensor's range, and what is to be told.
 
     The measurement stays at an end of its range in mid-movement, and the model of what comes
@@ -159,7 +167,8 @@ def _before_stop(problem: Problem, chosen: Callable[[Problem], Fit]) -> tuple[Pr
             # A controller, or a further command, may have made it stay.
             continue
         try:
-            fit = chosen(before.thinned(_FEW))
+            # Any model that follows the record tells whether it moves on.
+            fit = chosen(before.thinned(_FEW), SIMPLE)
         except IdentificationError:
             continue
         model = fit.problem.structure.model_at(fit.state.theta, fit.state.coefficients)
@@ -194,7 +203,7 @@ def _sign(records: Sequence[Record]) -> int:
     return found.pop() if found else 0
 
 
-def _by_noise(problem: Problem, fit: Fit, chosen: Callable[[Problem], Fit]) -> Fit:
+def _by_noise(problem: Problem, fit: Fit, chosen: Choose) -> Fit:
     """Fit again with each experiment weighted by its noise, where noises differ."""
     parts = fit.problem.experiments
     if len(parts) == 1:
@@ -227,9 +236,7 @@ def _weighted(problem: Problem, noise: FloatArray) -> Problem:
     return replace(problem, weight=weight)
 
 
-def _spared_of_outliers(
-    problem: Problem, fit: Fit, known: Known, chosen: Callable[[Problem], Fit]
-) -> Fit:
+def _spared_of_outliers(problem: Problem, fit: Fit, known: Known, chosen: Choose) -> Fit:
     """Fit again without isolated spikes, or with the loss that was asked for."""
     base = np.ones(problem.time.size)
     if fit.problem.weight is not None:
@@ -254,7 +261,8 @@ def _spared_of_outliers(
         return fit
     # They would pull both the choice and the fit.
     rest = replace(problem, weight=base) if len(problem.bounds) > 1 else problem
-    again = chosen(rest.part(~outlying))
+    # They hide differences, so that what was hopeless with them is without them.
+    again = chosen(rest.part(~outlying), names_near(fit))
     told = (
         f"{int(np.sum(outlying))} of the samples lie more than {_OUTLIER:g} standard deviations "
         "off every model and were left out: check the sensor for spikes"

@@ -31,6 +31,7 @@ from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Problem,
     Trial,
+    evaluate,
     left_in_simulation,
     refine,
 )
@@ -185,7 +186,7 @@ def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part,
     if problem.colour is None:
         problem = problem.thinned(_MOST_OF_HALVES)
     gain = state.coefficients[: len(problem.structure.powers)]
-    _, jacobian = _linearised(problem, gain, state.theta)
+    jacobian = _slopes(problem, gain, state.theta)
     size = np.einsum("pn,pn->p", jacobian, jacobian)
     size[size == 0.0] = 1.0
     information = np.cumsum(np.sum(jacobian**2 / size[:, None], axis=0))
@@ -197,8 +198,7 @@ def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part,
     second = replace(second, relaxation=bool(problem.structure.factors))
     parts = []
     for part in (problem.part(slice(None, middle)), second):
-        own = refine(part, state.theta, tolerance=TRIAL, most=_STEPS)
-        degrees = max(part.time.size - own.parameters, 1)
+        degrees = max(part.time.size - evaluate(part, state.theta).parameters, 1)
 
         def variance_of(left: FloatArray, degrees: int = degrees) -> float:
             return inflation * float(left @ left) / degrees
@@ -254,7 +254,6 @@ class _Point:
         theta, shape (p,).
     :param sign: of the gain.
     :param left: its residual, shape (n,).
-    :param jacobian: derivatives of the response, shape (p, n).
     :param variance: of the noise that the residual shows.
     :param far: squared distance from the estimate in standard deviations of the prior.
     """
@@ -262,7 +261,6 @@ class _Point:
     at: FloatArray
     sign: float
     left: FloatArray
-    jacobian: FloatArray
     variance: float
     far: float
 
@@ -301,18 +299,18 @@ class _Density:
         at = np.clip(at, self.centre - reach, self.centre + reach)
         at[-1] = max(float(at[-1]), 0.0)
         far = float(np.sum(((at - self.centre) / self.deviation) ** 2))
-        point = _Point(at, sign, np.empty(0), np.empty((0, 0)), 1.0, far)
-        gain = self.coefficients(point)
-        left, slopes = _linearised(self.problem, gain, self.theta(point))
-        by_log = gain @ slopes[: gain.size]
-        slopes[1 : gain.size] *= gain[0]
-        slopes[0] = by_log
-        variance = max(self.noise(left), NEGLIGIBLE**2)
-        return replace(point, left=left, jacobian=slopes, variance=variance)
+        point = _Point(at, sign, np.empty(0), 1.0, far)
+        left = _left(self.problem, self.coefficients(point), self.theta(point))
+        return replace(point, left=left, variance=max(self.noise(left), NEGLIGIBLE**2))
 
     def axes_at(self, point: _Point) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return singular values of the slopes in units of prior and noise, and their axes."""
-        scaled = point.jacobian * (self.deviation / math.sqrt(point.variance))[:, None]
+        gain = self.coefficients(point)
+        slopes = _slopes(self.problem, gain, self.theta(point))
+        by_log = gain @ slopes[: gain.size]
+        slopes[1 : gain.size] *= gain[0]
+        slopes[0] = by_log
+        scaled = slopes * (self.deviation / math.sqrt(point.variance))[:, None]
         axes, values, rows = np.linalg.svd(scaled, full_matrices=False)
         return axes, values, rows
 
@@ -459,20 +457,32 @@ def _normal(count: int, size: int, rng: np.random.Generator) -> FloatArray:
     return np.stack((half, -half), axis=1).reshape(-1, size)
 
 
-def _linearised(
-    problem: Problem, gain: FloatArray, theta: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return a model's residual and its derivatives, both after the fit of the nuisances.
+def _left(problem: Problem, gain: FloatArray, theta: FloatArray) -> FloatArray:
+    """Return what a model leaves after the fit of the nuisances, shape (n,).
 
     :param problem: the samples.
     :param gain: coefficients of the numerator, shape (k,).
     :param theta: shape (m,).
-    :return: shapes (n,) and (k + m, n).
+    """
+    columns, _ = problem.columns(theta)
+    left = problem.y - gain @ columns[: gain.size]
+    rows = problem.seen(np.concatenate((left[None, :], columns[gain.size :])))
+    return _beside(rows[:1], rows[1:])[0]
+
+
+def _slopes(problem: Problem, gain: FloatArray, theta: FloatArray) -> FloatArray:
+    """Return a model's derivatives by numerator and theta beside the nuisances, (k + m, n).
+
+    :param problem: the samples.
+    :param gain: coefficients of the numerator, shape (k,).
+    :param theta: shape (m,).
     """
     columns, derivatives = problem.columns(theta)
-    own, beside = problem.seen(columns[: gain.size]), problem.seen(columns[gain.size :])
-    basis, _ = np.linalg.qr(beside.T)
-    by_theta = problem.seen(np.einsum("k,mkn->mn", gain, derivatives[:, : gain.size]))
-    rows = np.concatenate(((problem.seen(problem.y) - gain @ own)[None, :], own, by_theta))
-    rows = rows - (rows @ basis) @ basis.T
-    return rows[0], rows[1:]
+    by_theta = np.einsum("k,mkn->mn", gain, derivatives[:, : gain.size])
+    own = np.concatenate((columns[: gain.size], by_theta))
+    return _beside(problem.seen(own), problem.seen(columns[gain.size :]))
+
+
+def _beside(rows: FloatArray, nuisances: FloatArray) -> FloatArray:
+    basis, _ = np.linalg.qr(nuisances.T)
+    return np.asarray(rows - (rows @ basis) @ basis.T)
