@@ -33,7 +33,7 @@ from relay_autotune.identification.waveform.residuals import colour_of, slow_col
 from relay_autotune.identification.waveform.separable import evaluate, problem_of
 from relay_autotune.identification.waveform.starts import start_fopdt
 from relay_autotune.process.response import response
-from relay_autotune.process.structures import FOPDT
+from relay_autotune.process.structures import FOPDT, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.cycles import find_relay, infer_settings
@@ -222,6 +222,28 @@ def test_a_process_that_visibly_rested_needs_no_past():
     best = _compared(context, NOTHING)[0]
     assert best.model.gain > 0.0
     assert not any(nuisances_of(best.problem)[1:])
+
+
+@pytest.mark.parametrize(
+    ("process", "turned"),
+    [
+        (TransferFunction.fopdt(20.0, 0.5, 0.1), True),
+        (TransferFunction(-20.0, (-2.0,), (1.5, 0.5), 0, 0.1), False),
+    ],
+)
+def test_a_model_of_the_other_direction_simulates_better_than_a_plain_one(process, turned):
+    """A voltage of a motor, whose model in colour had the gain of an integrator's late turn."""
+    time = 0.05 * np.arange(1200)
+    levels = np.random.default_rng(8).choice([-2.0, 0.0, 1.0], 40)
+    u = PiecewiseConstant(time[::30], levels, initial=0.0)
+    y = response(process, time, u) + 0.3 * np.random.default_rng(2).standard_normal(time.size)
+    context = FitContext.of(problem_of([(time, y, u)], FOPDT), 0, held=False)
+    problem = replace(context.problem, structure=structure_named("sopdt_zero"))
+    slow = [math.log(math.sqrt(1.5 * 0.5)), math.log(1.2)]
+    state = evaluate(problem, np.array([*slow, 0.1]))
+    own = np.array([-20.0, 40.0])
+    forced = replace(state, coefficients=np.append(own, state.coefficients[2:]))
+    assert context.simulates_worse(problem, forced) is turned
 
 
 def test_a_step_that_came_just_before_the_record_leaves_no_endless_dead_time():

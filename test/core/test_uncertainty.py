@@ -18,7 +18,7 @@ from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import Part
 from relay_autotune.identification.waveform.candidates import Candidate
 from relay_autotune.identification.waveform.fit_covariance import Fit, quantisation_step
-from relay_autotune.identification.waveform.posterior import _apart, posterior
+from relay_autotune.identification.waveform.posterior import _allowed, _apart, posterior
 from relay_autotune.identification.waveform.separable import evaluate, problem_of, refine
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
@@ -215,3 +215,16 @@ def test_a_half_with_one_model_says_nothing_of_the_scatter_between_halves():
         warnings.simplefilter("error")
         assert _apart((one, three), 1.0) == 0.0
     assert _apart((three, three), 1.0) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(("end", "explained"), [(400, True), (200, False)])
+def test_samples_that_no_response_explains_tell_nothing_of_a_process(end, explained):
+    """A rest with a slow disturbance gave a motor the other direction."""
+    rng, time = np.random.default_rng(1), 0.05 * np.arange(400)
+    u = PiecewiseConstant(np.array([9.0, 12.0]), np.array([0.01, 1.0]), 0.0)
+    y = response(TransferFunction.fopdt(2.0, 1.0, 0.3), time, u)
+    y = y + 0.05 * np.cumsum(rng.standard_normal(time.size)) + 0.01 * rng.standard_normal(400)
+    problem = problem_of([(time[:end], y[:end], u)], FOPDT)
+    known = np.array([2.0]), np.array([0.0, 0.3])
+    drawn = _allowed(problem, *known, 1.0, lambda left: float(left @ left) / end, 10, rng)
+    assert drawn.explains is explained

@@ -189,16 +189,29 @@ class FitContext:
         return latest_dead_times(self.problem, self.sign)
 
     @cached_property
-    def plain_sign(self) -> int:
-        """Direction of the FOPDT where it explains nearly all; 0: it does not.
+    def _left_by_fopdt(self) -> tuple[float, float]:
+        """Rms that the FOPDT leaves in simulation, and that of what it is to explain."""
+        return left_in_simulation(self.problem, self.fopdt)
+
+    def is_turned(self, state: Trial) -> bool:
+        """Return whether a fit has not the direction of a FOPDT that explains nearly all.
 
         A zero, and an integrator beside a drift, follow a slow disturbance with a gain of either
         sign.
+
+        :param state: the fit.
         """
-        left, total = left_in_simulation(self.problem, self.fopdt)
-        if left**2 > _NEARLY_ALL * total**2:
-            return 0
-        return 1 if self.fopdt.coefficients[0] > 0.0 else -1
+        left, total = self._left_by_fopdt
+        nearly = left**2 <= _NEARLY_ALL * total**2
+        return nearly and self.fopdt.coefficients[0] * state.coefficients[0] < 0.0
+
+    def simulates_worse(self, problem: Problem, state: Trial) -> bool:
+        """Return whether a fit simulates the record no better than the FOPDT does.
+
+        :param problem: of this context, with any structure and colour.
+        :param state: the fit.
+        """
+        return left_in_simulation(problem, state)[0] >= self._left_by_fopdt[0]
 
     @cached_property
     def least_friction(self) -> float:
@@ -235,6 +248,9 @@ class FitContext:
                 return None
         elif model.dead_time > self.latest[model.process_sign > 0]:
             return None
+        if not self.held and self.is_turned(state) and self.simulates_worse(problem, state):
+            # A colour explains the response, too: there a plain model shows the direction.
+            return None
         if min(problem.effects(state.coefficients)) < 0.0:
             # Commands may lose their effect on one side, but not act the other way there.
             return None
@@ -259,8 +275,7 @@ class FitContext:
             # A relay bounds an integrator and what grows by itself, and shows both.
             lasting = any(abs(t) > _LASTING * self.length for t in model.time_constants)
             late = model.dead_time > _LATE * self.length
-            turned = model.process_sign * self.plain_sign < 0
-            imitations += lasting or late or turned or not model.is_stable
+            imitations += lasting or late or self.is_turned(state) or not model.is_stable
             # The free rate of an integrator is what a free state is to a lag: one imitation.
             imitations -= problem.drift and model.integrators > 0
         return score + IMITATES_A_DRIFT * imitations

@@ -33,6 +33,7 @@ from relay_autotune.identification.waveform.separable import (
     Trial,
     evaluate,
     left_in_simulation,
+    left_of,
     refine,
 )
 from relay_autotune.process.structures import Structure
@@ -178,7 +179,8 @@ def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part,
     """Return the models that each half of a record allows in the chosen structure.
 
     The halves hold equal information on the parameters. Each has its own offset and free initial
-    state, the first one only where the whole record has one.
+    state, the first one only where the whole record has one. One that its own models do not
+    explain, such as a rest after all responses, tells nothing.
     """
     problem, state = fit.problem, fit.state
     if len(problem.bounds) > 1 or problem.structure.unstable:
@@ -204,7 +206,7 @@ def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part,
             return inflation * float(left @ left) / degrees
 
         found = _allowed(part, gain, state.theta, fit.scale, variance_of, _DRAWS_OF_HALF, rng)
-        if found.models:
+        if found.models and found.explains:
             ends = float(part.time[0]), float(part.time[-1])
             parts.append(Part(*ends, found.models, found.excludes_known))
     return tuple(parts)
@@ -239,11 +241,13 @@ class _Drawn:
     :param models: each as likely as the others.
     :param values: of their structure's parameters, shape (k, p).
     :param excludes_known: True: the samples exclude the estimate that they were asked of.
+    :param explains: True: the most likely one explains more of the samples than it leaves.
     """
 
     models: tuple[TransferFunction, ...]
     values: FloatArray
     excludes_known: bool = False
+    explains: bool = False
 
 
 @dataclass(frozen=True)
@@ -420,7 +424,11 @@ def _allowed(
             values.append(read[1])
     rise = start.cost(here.variance) - here.cost(here.variance)
     excluded = rise > 2.0 * float(gammaincinv(0.5 * centre.size, 1.0 - _EXCLUDED))
-    return _Drawn(tuple(models), np.array(values), excluded)
+    plain, at = replace(problem, colour=None), density.theta(here)
+    left = _left(plain, density.coefficients(here), at)
+    total = left_of(plain.seen(plain.y), plain.nuisances(at))
+    explains = 2.0 * float(left @ left) < float(total @ total)
+    return _Drawn(tuple(models), np.array(values), excluded, explains)
 
 
 def _within_the_record(structure: Structure, at: FloatArray, length: float) -> FloatArray:
