@@ -33,6 +33,7 @@ from relay_autotune.identification.waveform.separable import (
     refine,
 )
 from relay_autotune.identification.waveform.starts import (
+    LASTING,
     Guess,
     best_of,
     coarse,
@@ -76,15 +77,12 @@ STEPS, _INSTANTS, _STEPS_IN_TIME = 15, 60, 4
 # Twice the logarithm of the prior odds against a term that can imitate a drift, for which a
 # record without one has no use: 150 to 1.
 IMITATES_A_DRIFT = 10.0
-# Longest lag in lengths of the record: a longer one acts as an integrator.
-_LASTING = 2.0
 # Longest dead time in lengths of the record: a later response cannot be told from a drift.
 _LATE = 0.25
 # Longest of all: what came later than half of the record has nothing to confirm it.
 _LATEST = 0.5
-# Latest turn of an inverse response, in lengths of the test: a later one is a drift.
-_HORIZON = 2.0
-# Least dry friction, as a share of the command's range: the steps of a sensor look like a tenth.
+# Least dry friction or play, as a share of the command's range: the steps of a sensor look like
+# a tenth.
 _LEAST_FRICTION = 0.01
 # Largest share that a FOPDT leaves unexplained which shows the direction of the process.
 _NEARLY_ALL = 0.1
@@ -244,7 +242,7 @@ class FitContext:
             return None
         if self.sign * model.process_sign < 0:
             # A relay of the wrong direction oscillates on the first answer of an inverse response.
-            if not any(-_HORIZON * self.length < z.real < 0.0 for z in model.zeros):
+            if not any(-LASTING * self.length < z.real < 0.0 for z in model.zeros):
                 return None
         elif model.dead_time > self.latest[model.process_sign > 0]:
             return None
@@ -273,7 +271,7 @@ class FitContext:
         imitations = sum(nuisances_of(problem))
         if not self.held:
             # A relay bounds an integrator and what grows by itself, and shows both.
-            lasting = any(abs(t) > _LASTING * self.length for t in model.time_constants)
+            lasting = any(abs(t) > LASTING * self.length for t in model.time_constants)
             late = model.dead_time > _LATE * self.length
             imitations += lasting or late or self.is_turned(state) or not model.is_stable
             # The free rate of an integrator is what a free state is to a lag: one imitation.

@@ -50,8 +50,6 @@ from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record
 
 _UNEXPLAINED = 1.5
-# Least difference of the effects of commands to either side that is worth a sentence.
-_UNEQUAL = 0.05
 _WORTH_TELLING = 1e-3
 _OPEN = 0.01
 
@@ -280,7 +278,7 @@ def _warnings(
                 f"{which}{record.lost_samples} samples were lost on the way; check the network"
             )
     above, below = fit.problem.effects(fit.state.coefficients)
-    if abs(above - below) > _UNEQUAL:
+    if fit.problem.unequal:
         found.append(
             f"commands above the first one act {above:.2f} times as strongly as in the model, "
             f"those below it {below:.2f} times: the process is not linear, and the gains hold on "

@@ -162,7 +162,6 @@ def _gradient(problem: Problem, state: Trial, scale: float) -> FloatArray:
     return jacobian(values, point, relative_steps(point, logarithms))
 
 
-_MOST = 20_000
 # Least number of samples for each value, on average: values on a grid repeat.
 _TIMES_EACH = 3.0
 _ROUNDED = 1e-3
@@ -173,9 +172,8 @@ def quantisation_step(measurement: FloatArray) -> float:
 
     :param measurement: the samples [y], shape (n,).
     """
-    some = measurement[:: max(1, measurement.size // _MOST)]
-    levels = np.unique(some)
-    if levels.size < 2 or _TIMES_EACH * levels.size > some.size:
+    levels = np.unique(measurement)
+    if levels.size < 2 or _TIMES_EACH * levels.size > measurement.size:
         return 0.0
     gaps = np.diff(levels)
     # Decimal numbers are on their grid to rounding only.

@@ -37,8 +37,9 @@ from relay_autotune.record.record import Input, PiecewiseConstant
 _SAMPLES_A_SWING = 4.0
 # Shortest response of a process, in intervals between samples.
 _SHORTEST_RESPONSE = 0.5
-# Longest zero in lengths of the record: beyond, a slow pole cancels it, or it is a drift.
-_LONGEST_ZERO = 2.0
+# Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and a
+# longer zero, or a later turn of an inverse response, as a drift.
+LASTING = 2.0
 # A response is seen where the measurement leaves the mean of a rest by this many times the range
 # of the rest, by this many of its standard deviations, and by this share of the whole range.
 _RANGES, _DEVIATIONS, _SHARE = 3.0, 6.0, 0.03
@@ -71,7 +72,7 @@ def is_unobservable(
     whole = model.dead_time + sum(abs(c) for c in model.time_constants)
     if not model.integrators and whole < _SHORTEST_RESPONSE * interval:
         return True
-    if any(abs(zero) > _LONGEST_ZERO * length for zero in model.zeros):
+    if any(abs(zero) > LASTING * length for zero in model.zeros):
         return True
     if not (model.is_stable or model.integrators) or all(zero.real >= 0.0 for zero in model.zeros):
         return False
