@@ -42,6 +42,7 @@ class Kind(Enum):
 
 _JOINTS = (Kind.JOINT, Kind.OPENED)
 _ALL = (Kind.NODES, *_JOINTS, Kind.TOPICS)
+_COMMAND = (*_JOINTS, Kind.TOPICS, Kind.NODES)
 # The relay commands the actuator itself.
 _COMMANDING = (Kind.OPENED, Kind.TOPICS)
 
@@ -108,9 +109,28 @@ class Setting(Quantity):
 
 
 SETTINGS = (
+    Setting("dry_run", False, loops=_COMMAND).means(
+        "only ask whether a tune could start, and how"
+    ),
+    Setting("namespace", "", metavar="NS", loops=_COMMAND).means(
+        "namespace of the loop; with --web several, separated by commas"
+    ),
+    Setting("node", "relay_node", metavar="NAME", loops=_COMMAND).means(
+        "name of the relay_node (%(default)s)"
+    ),
+    Setting("record_only", False, loops=_COMMAND).means(
+        "tune without an identifier_node: a recording, and no model"
+    ),
+    Setting("wait", 5.0, "s", loops=_COMMAND).means(
+        "how long to wait for the nodes [s] (%(default)s)"
+    ),
+    Setting("report", "", metavar="FILE", loops=_COMMAND).means(
+        "write a report: .html, or a picture: .png, .svg or .pdf"
+    ),
+    Setting("json", False, loops=_COMMAND).means("print the result as JSON"),
     Setting(
-        "amplitude", 0.0, "u", example="0", parameters=("amplitude",),
-        question="half the distance of the relay's two commands; 0: found by the tune", loops=_ALL,
+        "amplitude", 0.0, "u", example="0", parameters=("amplitude",), loops=_COMMAND,
+        question="half the distance of the relay's two commands; 0: found by the tune",
     ).means("half the distance of the two commands [u]; default: the node's parameter"),
     Setting("measurement", "", metavar="TOPIC", loops=_COMMANDING).means("topic that measures"),
     Setting("command", "", metavar="TOPIC").means("topic that commands the actuator"),
@@ -429,7 +449,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     """
     groups = {kind: parser.add_argument_group(*told) for kind, told in _GROUPS.items()}
     for each in SETTINGS:
-        each.add_to(parser if each.name == "amplitude" else groups[each.loops[-1]])
+        each.add_to(groups.get(each.loops[-1], parser))
 
 
 def kind_of(options: argparse.Namespace) -> Kind:

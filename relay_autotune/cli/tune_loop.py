@@ -34,7 +34,6 @@ from relay_autotune.cli.arguments import (
     NOTHING_FOUND,
     add_web,
     check_web,
-    finite,
     guarded_in_graph,
     say,
 )
@@ -121,7 +120,8 @@ def _require_no_parameter(
         name, is_set, value = given.partition(":=")
         if flag not in ("-p", "--param") or not is_set or name == "use_sim_time":
             continue
-        node = "/".join(("", *filter(None, (options.namespace.strip("/"), options.node))))
+        space = (options.namespace or "").strip("/")
+        node = "/".join(("", *filter(None, (space, options.node))))
         do = f"give {FLAGS[name]} {value}" if name in FLAGS else "leave it out"
         if name not in FLAGS and not (options.measurement or options.joint):
             do = typed_for_parameter(node, name, value)
@@ -145,29 +145,6 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=Help,
         epilog="Example:\n  tune_loop --namespace tank --amplitude 0.5 --report tank.html",
     )
-    parser.add_argument(
-        "--dry-run", action="store_true", help="only ask whether a tune could start, and how"
-    )
-    parser.add_argument(
-        "--namespace", default="", metavar="NS",
-        help="namespace of the loop; with --web several, separated by commas",
-    )  # fmt: skip
-    parser.add_argument(
-        "--node", default="relay_node", metavar="NAME", help="name of the relay_node (%(default)s)"
-    )
-    parser.add_argument(
-        "--record-only", action="store_true",
-        help="tune without an identifier_node: a recording, and no model",
-    )  # fmt: skip
-    parser.add_argument(
-        "--wait", type=finite, default=5.0, metavar="S",
-        help="how long to wait for the nodes [s] (%(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--report", metavar="FILE",
-        help="write a report: .html, or a picture: .png, .svg or .pdf",
-    )  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
     add_settings(parser)
     add_web(parser, "serve a page on which tunes are started, watched and ended, until Ctrl-C")
     return parser
@@ -266,7 +243,8 @@ class Session:
 
             robot = self._joined(LoopClient, own, "", options.node, ros)
             return [JointLoop(robot, options, client)]
-        spaces = options.namespace.split(",") if options.web else [options.namespace]
+        given = options.namespace or ""
+        spaces = given.split(",") if options.web else [given]
         # The loops of a page have settings of their own.
         return [Loop(client(space), argparse.Namespace(**vars(options))) for space in spaces]
 
