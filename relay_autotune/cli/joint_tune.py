@@ -9,7 +9,7 @@ import argparse
 import json
 import math
 import shlex
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import Any
@@ -312,14 +312,6 @@ class JointLoop(Loop):
             "relay_on": "setpoint",
             "setpoint": self._loop.state.reference,
         }
-
-    def parameters(self, names: Collection[str]) -> dict[str, Any]:
-        """Return the parameters of relay_node that some settings set, as far as they are known."""
-        found = super().parameters(names)
-        if self._forward is None and "within" in names:
-            # The levels are references, which have the limits of the measurement.
-            found |= ranges(None, self.options.within)
-        return found
 
     def _at_controller(self) -> tuple[dict[str, str], dict[str, Any]]:
         """Return topics and parameters of a node that hears the controller and moves it."""

@@ -251,11 +251,12 @@ class Readiness:
         last: tuple[float, Cycle] | None,
     ) -> Ready:
         """Return what a tune would do; raise the reason where that is not possible."""
-        parameters.validate()
         moves_setpoint = self._ends.setpoint is not None
         if moves_setpoint:
+            # First: the levels are found within the limits of the measurement.
             parameters, baseline = _on_setpoint(parameters)
         else:
+            parameters.validate()
             baseline = _baseline_from(values["baseline"], self._loop.mean_command(), held)
             if why := parameters.why_one_way(baseline):
                 raise NotReadyError(why)
