@@ -32,9 +32,9 @@ from relay_autotune.cli.loops import PATIENCE, Loop, Steps
 from relay_autotune.cli.own_nodes import (
     PROGRAM,
     START_WITHIN,
-    ranges,
     ros_arguments,
 )
+from relay_autotune.cli.settings import SETTING
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import (
     UNITS,
@@ -241,10 +241,9 @@ class Proof:
         )
 
     @contextmanager
-    def _controller(self, step: float, doubtful: bool) -> Iterator[GainsClient]:
+    def _controller(self, doubtful: bool) -> Iterator[GainsClient]:
         """Start a controller_node in front of relay_node, and end it with the block.
 
-        :param step: of the set-point [y].
         :param doubtful: whether the gains are.
         """
         loop, rest, within, commands = self._loop, self._rest, self._within, self._commands
@@ -259,8 +258,8 @@ class Proof:
                 "initial_setpoint": rest.setpoint,
                 "initial_command": rest.baseline,
                 "safe_command": rest.baseline,
-                **ranges((within.low, within.high), (commands.low, commands.high)),
-                "verify_step_max": abs(step),
+                **SETTING["within"].values((within.low, within.high)),
+                **SETTING["command_within"].values((commands.low, commands.high)),
                 "measurement_type": kind,
                 "measurement_field": options.field,
                 "accept_doubtful": str(doubtful).lower(),
@@ -294,7 +293,7 @@ class Proof:
         """
         self.allowed.require(step)
         patience = max(_TIMES_SETTLING * self._settles, _REST_WITHIN)
-        with self._controller(step, doubtful) as controller:
+        with self._controller(doubtful) as controller:
             tell(f"starting {CONTROLLER}")
             controller.find(START_WITHIN, leave)
             with controller.offered(self._message) as gains:

@@ -23,7 +23,6 @@ from relay_autotune.cli.own_nodes import (
     PROGRAM,
     START_WITHIN,
     namespace_of_joint,
-    ranges,
     ros_arguments,
 )
 from relay_autotune.cli.settings import SETTING, Setting
@@ -323,7 +322,7 @@ class JointLoop(Loop):
             "command_type": COMMAND_TYPE,
             "command_field": loop.reference_field,
             "command_message": json.dumps(loop.reference_alone),
-            **ranges(self.options.within, None),
+            **SETTING["within"].values(self.options.within),
         }
 
     def _opened_ends(self) -> tuple[dict[str, str], dict[str, Any]]:

@@ -75,21 +75,6 @@ def ros_arguments(
     return arguments
 
 
-def ranges(
-    measurement: Sequence[float] | None, command: Sequence[float] | None
-) -> dict[str, float]:
-    """Return the parameters of a node that say between what measurement and command stay.
-
-    :param measurement: lowest and highest [y]; None: not given.
-    :param command: lowest and highest [u]; None: not given.
-    """
-    found: dict[str, float] = {}
-    for name, limits in (("measurement", measurement), ("command", command)):
-        if limits is not None:
-            found |= dict(zip((f"{name}_min", f"{name}_max"), limits, strict=True))
-    return found
-
-
 class OwnNodes:
     """Start nodes as processes of the command, and end all of them with the block.
 
