@@ -297,7 +297,7 @@ class JointLoop(Loop):
         """Return the arguments for ROS of the nodes that tune it."""
         loop, options = self._loop, self.options
         topics, values = self._opened_ends() if options.open else self._closed_ends()
-        values |= self.parameters((*self.form, "measurement_timeout"))
+        values |= self.answers.parameters((*self.form, "measurement_timeout"))
         nodes = {"relay_node": ros_arguments(self.space, topics, values)}
         if not options.record_only:
             design = {"law": loop.law, "sample_period": loop.period}

@@ -15,7 +15,7 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cached_property
 from itertools import zip_longest
@@ -102,15 +102,11 @@ class Loop:
         if unknown := set(changed) - set(self.form):
             raise SelectionError(f"{', '.join(sorted(unknown))} is no setting of {self.title}")
         self.answers.take(changed)
-        self.client.set_values(self.client.name, self.parameters(changed))
+        self.client.set_values(self.client.name, self.answers.parameters(changed))
 
     def lacking(self) -> list[str]:
         """Return the questions that must be answered before a tune."""
         return self.answers.lacking(self.form) if self.has_own_nodes else []
-
-    def parameters(self, names: Collection[str]) -> dict[str, Any]:
-        """Return the parameters of relay_node that some settings set, as far as they are known."""
-        return self.answers.parameters(names)
 
     def look(self) -> None:
         """Take the settings that relay_node has now; nobody else changes one of this command."""
@@ -132,14 +128,14 @@ class Loop:
         names = [name for name in self.form if name != "amplitude" or options.web]
         given = [n for n in (*names, "measurement_timeout") if SETTING[n].is_given(options)]
         if given:
-            self.client.set_values(self.client.name, self.parameters(given))
+            self.client.set_values(self.client.name, self.answers.parameters(given))
         if options.web:
             self.look()
 
     def ask_again(self) -> None:
         """Ask for the last answer again, and tell relay_node."""
         changed = self.answers.ask_again()
-        self.client.set_values(self.client.name, self.parameters(changed))
+        self.client.set_values(self.client.name, self.answers.parameters(changed))
 
     def before_tune(self) -> None:
         """End what proves gains on a page."""
