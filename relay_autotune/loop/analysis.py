@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -39,6 +39,7 @@ from relay_autotune.loop.gains import (
 )
 from relay_autotune.loop.law import LawRate, SampledLaw
 from relay_autotune.loop.laws import LAWS, OWN_LAW
+from relay_autotune.loop.sampled import ClosedLoop
 from relay_autotune.loop.stability import (
     closed_loop_unstable_poles,
     frequencies,
@@ -63,20 +64,6 @@ _SETTLED = 1e-3
 # A smaller final error counts as zero.
 _NO_OFFSET = 1e-3
 BAND = 0.02
-
-
-@dataclass(frozen=True)
-class StepResponse:
-    """Deviations after a unit step of set-point or load at t = 0.
-
-    :param time: s, shape (n,), equally spaced.
-    :param measurement: y, shape (n,).
-    :param command: u, shape (n,); after a load step without the load itself.
-    """
-
-    time: FloatArray
-    measurement: FloatArray
-    command: FloatArray
 
 
 def abscissae(duration: float | FloatArray, points: int) -> ComplexArray:
@@ -206,11 +193,12 @@ class Loop:
 
     def step_responses(
         self, duration: float, points: int = _POINTS
-    ) -> tuple[StepResponse, StepResponse]:
+    ) -> tuple[ClosedLoop, ClosedLoop]:
         """Return the responses to a unit step of the set-point, and to one of the load.
 
-        The loop must be stable. The command just after a step of the set-point lacks what the
-        derivative of the error adds to a few samples, unless the instants are the samples.
+        The loop must be stable. The command after a load step is without the load itself; just
+        after a step of the set-point it lacks what the derivative of the error adds to a few
+        samples, unless the instants are the samples.
 
         :param duration: s.
         :param points: number of instants.
@@ -227,8 +215,8 @@ class Loop:
         if not sampled:
             u_r = u_r - self._kick(s)
         return (
-            StepResponse(time, inverse(y_r), inverse(u_r, self._first_command(kick=False))),
-            StepResponse(time, inverse(y_d), inverse(u_d)),
+            ClosedLoop(time, inverse(y_r), inverse(u_r, self._first_command(kick=False))),
+            ClosedLoop(time, inverse(y_d), inverse(u_d)),
         )
 
     def _has_instants(self, duration: float, points: int) -> bool:
@@ -308,7 +296,7 @@ class Loop:
         )
 
     def _at_rest(
-        self, frequency: float, setpoint: StepResponse
+        self, frequency: float, setpoint: ClosedLoop
     ) -> tuple[float, float, tuple[float, float]]:
         """Return where both responses end, and the integrals of both errors [y s]."""
         step = float(setpoint.time[1])
@@ -324,7 +312,7 @@ class Loop:
         whole = 0.0 if abs(1.0 - final) < _NO_OFFSET else math.inf
         return final, float(to_load[0].real), (whole, math.inf)
 
-    def _effort(self, setpoint: StepResponse) -> float:
+    def _effort(self, setpoint: ClosedLoop) -> float:
         """Return the total variation of the command after a unit step of the set-point."""
         size, law, command = setpoint.time.size, self.law, setpoint.command
         if self._has_instants(float(setpoint.time[1]) * size, size):
