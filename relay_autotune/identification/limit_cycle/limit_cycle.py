@@ -49,14 +49,12 @@ NOT_SETTLED = "the limit cycle had not settled: its last cycles still differ"
 class RelayTest:
     """A relay test for the methods that need a limit cycle only.
 
-    :param method: on whose behalf it is read, for messages.
     :param record: the record.
     :param settings: the relay, inferred where the record does not have it.
     :param cycle: averages over the cycles that agree.
     :param bounds: samples at which these begin, and at which the last one ends.
     """
 
-    method: str
     record: Record
     settings: RelaySettings
     cycle: LimitCycle
@@ -71,17 +69,6 @@ class RelayTest:
     def sign(self) -> int:
         """Sign of the process's gain by the direction of the relay."""
         return -1 if self.settings.reverse_acting else 1
-
-    def require_unbiased(self) -> None:
-        """Refuse a biased relay.
-
-        :raises IdentificationError: if the bias is more than 1 % of the relay's amplitude.
-        """
-        if abs(self.settings.bias) > NO_BIAS * self.settings.amplitude:
-            raise IdentificationError(
-                f"the relay had a bias of {self.settings.bias:g}, but the equations of "
-                f"{self.method} hold for a symmetric one: use the method wang_biased or waveform"
-            )
 
     def known_gain(self, known: Known) -> float:
         """Return the size of the known gain, NaN if it is not known.
@@ -129,14 +116,17 @@ class RelayTest:
         return found
 
 
-def relay_test(method: str, record: Record, *, two_levels: bool = True) -> RelayTest:
+def relay_test(
+    method: str, record: Record, *, two_levels: bool = True, unbiased: bool = False
+) -> RelayTest:
     """Read a record as a relay test.
 
     :param method: on whose behalf, for the message.
     :param record: the record.
     :param two_levels: False: the command may take the time it needs from level to level.
+    :param unbiased: True: the equations are those of a symmetric relay.
     :raises IdentificationError: if it holds no whole cycle, too few samples in one, no motion,
-        or a command of more than two levels.
+        a command of more than two levels, or a bias of more than 1 % of the amplitude.
     """
     settings = settings_of(record)
     bounds = cycle_bounds(record)
@@ -162,7 +152,12 @@ def relay_test(method: str, record: Record, *, two_levels: bool = True) -> Relay
     if two_levels:
         span = record.time[[bounds[0], bounds[-1]]]
         _require_two_levels(method, settings, record.input(), span)
-    return RelayTest(method, record, settings, average, bounds)
+    if unbiased and abs(settings.bias) > NO_BIAS * settings.amplitude:
+        raise IdentificationError(
+            f"the relay had a bias of {settings.bias:g}, but the equations of {method} hold for a "
+            "symmetric one: use the method wang_biased or waveform"
+        )
+    return RelayTest(record, settings, average, bounds)
 
 
 def _require_two_levels(

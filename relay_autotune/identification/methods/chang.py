@@ -332,8 +332,7 @@ def _from_record(
         without the structure the simplest model that fits is taken.
     :raises IdentificationError: if the relay was biased, or no such model has the limit cycle.
     """
-    test = relay_test(method.name, record)
-    test.require_unbiased()
+    test = relay_test(method.name, record, unbiased=True)
     gain, settings = test.known_gain(known), test.settings
     dead_time, std, source = read_dead_time(test, known)
     late = dead_time + settings.extra_delay

@@ -260,9 +260,7 @@ def identify_li_jointly(records: Sequence[Record], known: Known = NOTHING) -> Id
     :raises IdentificationError: if there are too few tests, one was biased, they do not differ,
         or no model agrees with them.
     """
-    tests = [relay_test(METHOD, record) for record in records]
-    for test in tests:
-        test.require_unbiased()
+    tests = [relay_test(METHOD, record, unbiased=True) for record in records]
     if len({test.sign for test in tests}) > 1:
         raise IdentificationError(
             "one of the tests had a reverse-acting relay and another did not: they are not of "

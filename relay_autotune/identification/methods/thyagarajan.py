@@ -175,8 +175,7 @@ def identify_thyagarajan(record: Record, known: Known = NOTHING) -> Identificati
         that the structure assumes.
     :raises IdentificationError: if the relay was biased, or no such model has the limit cycle.
     """
-    test = relay_test(METHOD, record)
-    test.require_unbiased()
+    test = relay_test(METHOD, record, unbiased=True)
     shape, reading = read_shape(record)
     one_lag = known.structure in (FOPDT.name, UNSTABLE_FOPDT.name)
     if one_lag and shape.category in ("2", "3"):

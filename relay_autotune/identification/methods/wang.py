@@ -357,8 +357,7 @@ def identify_unbiased(record: Record, known: Known = NOTHING) -> Identification:
     :param known: a known gain takes the place of eqs 23 to 25.
     :raises IdentificationError: if the relay was biased, or no FOPDT process has the limit cycle.
     """
-    test = relay_test("wang_unbiased", record)
-    test.require_unbiased()
+    test = relay_test("wang_unbiased", record, unbiased=True)
     gain, mu = test.known_gain(known), test.settings.amplitude
 
     def equations(numbers: FloatArray) -> Fopdt:
