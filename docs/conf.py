@@ -19,7 +19,8 @@ copyright = author  # noqa: A001, as Sphinx calls it
 version = release = re.search(r"<version>(.*)</version>", _manifest.read_text())[1]
 
 extensions = ["myst_parser", "sphinx_copybutton"]
-exclude_patterns = ["files"]
+# Results of benchmarks are pages that other pages link to.
+suppress_warnings = ["toc.not_included"]
 myst_heading_anchors = 4
 copybutton_exclude = ".linenos, .gp, .go"
 

@@ -112,8 +112,11 @@ def stage(source: Path) -> None:
             text += contents_block(written)
         (source / name).write_text(text)
         for file in re.findall(r"\]\(files/([^)#]+)\)", text):
-            (source / "files" / file).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(ROOT / file, source / "files" / file)
+            copy = source / "files" / file
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / file, copy)
+            if copy.suffix == ".md":  # results of a benchmark, a page of the site, too
+                copy.write_text(copy.read_text().replace("](../../docs/", "](../../../"))
 
 
 def main() -> int:
