@@ -197,12 +197,6 @@ class SymmetricCycle:
     dead_time: float
     errors: tuple[float, float] = CHART_ERRORS
 
-    @classmethod
-    def of(cls, test: RelayTest, read: Reading, errors: tuple[float, float]) -> SymmetricCycle:
-        """Return what :meth:`RelayTest.read` has read, with a dead time as the last number."""
-        period, amplitude, level, dead_time = read.values.tolist()
-        return cls(period, amplitude, test.settings.amplitude, level, dead_time, errors)
-
     @property
     def frequency(self) -> float:
         """Frequency of the limit cycle, eq 1 of Chang et al. [rad/s]."""

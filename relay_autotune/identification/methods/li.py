@@ -321,13 +321,14 @@ def _shape_misfit(
 
 def _cycle(test: RelayTest, read: Reading) -> SymmetricCycle:
     """Return the averaged limit cycle, with the relative errors of period and amplitude."""
-    period, amplitude = (np.nan_to_num(read.std[:2]) / read.values[:2]).tolist()
-    sampled = _SHARE_OF_INTERVAL * test.record.interval / float(read.values[0])
+    period, amplitude, level, added = read.values.tolist()
+    scatter = np.nan_to_num(read.std[:2]) / read.values[:2]
+    sampled = _SHARE_OF_INTERVAL * test.record.interval / period
     errors = (
-        max(period, sampled, _LEAST_PERIOD_ERROR),
-        max(amplitude, _LEAST_AMPLITUDE_ERROR),
+        max(float(scatter[0]), sampled, _LEAST_PERIOD_ERROR),
+        max(float(scatter[1]), _LEAST_AMPLITUDE_ERROR),
     )
-    return SymmetricCycle.of(test, read, errors)
+    return SymmetricCycle(period, amplitude, test.settings.amplitude, level, added, errors)
 
 
 def _remarks(cycles: Sequence[SymmetricCycle], known: Known, fit: JointFit) -> list[str]:
