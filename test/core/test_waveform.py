@@ -342,7 +342,7 @@ def test_a_structure_of_which_no_fit_can_begin_is_left_out():
     told = record.time, record.measurement, record.input()
     # One of those that are fitted whatever others promise.
     problem = problem_of([told], TABLE["fopdt"])
-    assert multistart(problem, [], 1e-6) is None
+    assert multistart(problem, []) is None
 
 
 def test_few_samples_do_not_meet_a_periodic_command_at_one_instant_each_time():

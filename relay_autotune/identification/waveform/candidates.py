@@ -405,7 +405,7 @@ class FitContext:
         found = []
         for structure in (SOPDT_ZERO, INTEGRATOR_INVERSE):
             problem = replace(self.problem, structure=structure)
-            state = multistart(problem, self.guess.turned(structure), TRIAL)
+            state = multistart(problem, self.guess.turned(structure))
             found.append(None if state is None else self.candidate(problem, state))
         return [c for c in found if c is not None and c.model.process_sign * self.sign < 0]
 
@@ -418,17 +418,12 @@ class FitContext:
         return self.sign * candidate.model.process_sign >= 0 and (self.held or not late)
 
     def refit(
-        self,
-        candidate: Candidate,
-        colour: Colour | None,
-        most: int,
-        hopeless: float = math.inf,
+        self, candidate: Candidate, colour: Colour | None, hopeless: float = math.inf
     ) -> Candidate | None:
         """Fit a candidate in another colour, from where it is.
 
         :param candidate: of this context's samples.
         :param colour: of the noise; None: white.
-        :param most: largest number of steps.
         :param hopeless: score beyond which it is given up, if not even a model that is linear in
             its parameters reaches it.
         """
@@ -437,7 +432,7 @@ class FitContext:
         linear = replace(state, cost=predicted_cost(problem, state))
         if self._score(problem, linear, candidate.model) > hopeless:
             return None
-        return self.candidate(problem, refine(problem, state, tolerance=TRIAL, most=most))
+        return self.candidate(problem, refine(problem, state, tolerance=TRIAL, most=STEPS))
 
     def _family(self, name: str, order: int) -> Iterator[Structure]:
         """Yield the structures of a name that there are samples enough for."""
@@ -464,7 +459,7 @@ class FitContext:
         if structure == IPDT:
             # A command off its balance leaves a drift, which is a term of its own.
             least = math.inf
-        return multistart(problem, self.guess.starts(structure, growing), TRIAL, least)
+        return multistart(problem, self.guess.starts(structure, growing), least)
 
 
 def nuisances_of(problem: Problem, terms: Iterable[str] = TERMS) -> tuple[bool, ...]:

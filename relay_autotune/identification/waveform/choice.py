@@ -123,17 +123,17 @@ def chosen_fit(
     found = [c for c in found if few.may_be_chosen(c) or sign * c.model.process_sign < 0]
     own = [c for c in found if few.may_be_chosen(c)]
     if found and sign and not known.structure:
-        turned = (few.refit(c, found[0].problem.colour, STEPS) for c in few.turned())
+        turned = (few.refit(c, found[0].problem.colour) for c in few.turned())
         found = [*found, *(c for c in turned if c is not None)]
     # Where a disturbance that no term describes made a colour that explains the response, too,
     # the simulation shows it.
-    white = (few.refit(c, None, STEPS) for c in own if c.problem.colour is not None)
+    white = (few.refit(c, None) for c in own if c.problem.colour is not None)
     simulated = sorted((c for c in white if c is not None), key=lambda c: c.score)
     for candidate in (*_by_rank(own), *_by_rank(simulated)):
         fit = _finished(candidate, found, problem, scale)
-        if fit is not None and responds(fit.problem, fit.state, _SEARCHED):
+        if fit is not None and responds(fit.problem, fit.state):
             return fit
-    if known.structure and responds(few.problem, few.fopdt, _SEARCHED):
+    if known.structure and responds(few.problem, few.fopdt):
         raise IdentificationError(
             f"no {known.structure} model explains the record; leave the structure open to have "
             "it chosen"
@@ -158,18 +158,17 @@ def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candid
     return sorted((c for c in again if c is not None), key=lambda c: c.score) or found
 
 
-def responds(problem: Problem, state: Trial, evidence: float = 0.0) -> bool:
+def responds(problem: Problem, state: Trial) -> bool:
     """Return whether a fit explains more than its parameters cost, beside drift and the like.
 
     :param problem: what was fitted.
     :param state: its fit.
-    :param evidence: by how much more, in units of the score.
     """
     n, floor = problem.y.size, problem.y.size * NEGLIGIBLE**2
     nuisance = problem.nuisances(state.theta)
     left = left_of(problem.seen(problem.y), nuisance)
     without = information_criterion(float(left @ left), n, nuisance.shape[0], floor)
-    return information_criterion(state.cost, n, state.parameters, floor) < without - evidence
+    return information_criterion(state.cost, n, state.parameters, floor) < without - _SEARCHED
 
 
 def _dense_enough(problem: Problem, sign: int, held: bool) -> FitContext:
@@ -205,7 +204,7 @@ def _compared(context: FitContext, known: Known, among: Sequence[str] = TRIED) -
     tried: set[tuple[bool, ...]] = set()
     decided = _with_best_terms(context, simple)
     while decided:
-        white = (context.refit(c, None, STEPS) for c in decided)
+        white = (context.refit(c, None) for c in decided)
         ready = [*simple, *(c for c in white if c is not None)]
         for each in decided:
             if nuisances_of(each.problem) not in tried:
@@ -217,7 +216,7 @@ def _compared(context: FitContext, known: Known, among: Sequence[str] = TRIED) -
         if not found or known.structure:
             break
         # The best structure of all may need others than the simple ones.
-        again = _with_best_terms(context, [context.refit(found[0], None, STEPS) or found[0]])
+        again = _with_best_terms(context, [context.refit(found[0], None) or found[0]])
         decided = [
             c for c in again if c.score < found[0].score and nuisances_of(c.problem) not in tried
         ]
@@ -249,7 +248,7 @@ def _with_best_terms(context: FitContext, found: Sequence[Candidate]) -> list[Ca
 def _in_own_colour(context: FitContext, candidate: Candidate) -> Candidate:
     """Return a candidate in the colour of its residual, or white where that is likelier."""
     colour = _colour(candidate.problem, candidate.state)
-    coloured = None if colour is None else context.refit(candidate, colour, STEPS)
+    coloured = None if colour is None else context.refit(candidate, colour)
     return candidate if coloured is None else min(candidate, coloured, key=lambda c: c.score)
 
 
@@ -337,7 +336,7 @@ def _in(colour: Colour | None, found: list[Candidate], context: FitContext) -> l
     most = math.inf
     for candidate in sorted(found, key=lambda c: c.score):
         plain = candidate.structure.name in PLAIN
-        fitted = context.refit(candidate, colour, STEPS, math.inf if plain else most)
+        fitted = context.refit(candidate, colour, math.inf if plain else most)
         if fitted is not None:
             again.append(fitted)
             most = min(most, fitted.score + _HOPELESS)

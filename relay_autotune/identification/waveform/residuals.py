@@ -179,18 +179,17 @@ def slow_colour(pole: float) -> Colour:
     return Colour(np.array([pole]), np.array([[math.sqrt(1.0 - pole**2)]]))
 
 
-def colour_of(parts: Sequence[FloatArray], most: int = _MOST_LAGS) -> Colour | None:
+def colour_of(parts: Sequence[FloatArray]) -> Colour | None:
     """Return the colour of residuals: Burg's autoregression of the order that BIC prefers.
 
     Burg's recursion minimises the errors of prediction forward and backward together, which
     keeps every autoregression stable, however near to 1 a pole lies.
 
     :param parts: residuals of each experiment, in the order of time.
-    :param most: largest order.
     :return: None: order 0, the noise is white.
     """
     n = sum(part.size for part in parts)
-    most = min(most, n // _SAMPLES_EACH, min(part.size for part in parts) - 2)
+    most = min(_MOST_LAGS, n // _SAMPLES_EACH, min(part.size for part in parts) - 2)
     forward = [part.copy() for part in parts]
     backward = [part.copy() for part in parts]
     power = sum(float(part @ part) for part in parts) / n

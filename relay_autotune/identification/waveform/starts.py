@@ -213,7 +213,7 @@ def coarse(problem: Problem) -> Problem:
 
 
 def multistart(
-    problem: Problem, thetas: Sequence[FloatArray], tolerance: float, least: float = math.inf
+    problem: Problem, thetas: Sequence[FloatArray], least: float = math.inf
 ) -> Trial | None:
     """Return the best fit that any of some starts leads to; None where it is hopeless.
 
@@ -222,7 +222,6 @@ def multistart(
 
     :param problem: the problem.
     :param thetas: starts.
-    :param tolerance: relative gain below which a step is the last one.
     :param least: mean square of the best structure so far, in squares of the range: a fit that
         will not come near it is given up.
     """
@@ -241,7 +240,7 @@ def multistart(
         if reached[0].cost > bound:
             return None
     last = [s for s in reached if s.cost <= _UNDECIDED * reached[0].cost][:2]
-    fits = [refine(problem, s.theta, tolerance=tolerance, damping=s.damping) for s in last]
+    fits = [refine(problem, s.theta, tolerance=TRIAL, damping=s.damping) for s in last]
     return min(fits, key=lambda s: s.cost)
 
 
@@ -251,7 +250,7 @@ def best_of(problem: Problem, thetas: Sequence[FloatArray]) -> Trial:
     :param problem: the problem.
     :param thetas: starts, at least one.
     """
-    found = multistart(problem, thetas, TRIAL)
+    found = multistart(problem, thetas)
     assert found is not None
     return found
 
