@@ -64,8 +64,6 @@ from relay_autotune_msgs.msg import PidGains
 _Result = TypeVar("_Result")
 # How long messages are handled before wishes are looked at [s].
 _TICK = 0.05
-# How long to wait for what the analysis needs from the nodes [s].
-_PATIENCE = 5.0
 _TONES = {"completed": "good", "aborted": "bad", "failed": "bad"}
 
 
