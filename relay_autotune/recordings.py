@@ -195,30 +195,50 @@ def _taken_apart(record: Record, *, whole: bool) -> tuple[list[Record], list[str
     """
     from relay_autotune.record.excitation import find_experiments
 
+    missing = _missing_rows(record) if len(record) > 1 else []
     if whole or len(record) < _FEWEST_SAMPLES:
-        return [record], []
+        return [record], missing
     stretches = find_experiments(record)
     if not stretches:
         if np.ptp(record.measurement) == 0.0 or np.ptp(record.command) == 0.0:
             # The identification then tells why nothing can be learned from it.
-            return [record], []
+            return [record], missing
         raise BagError(
-            "no relay phase, step, pulse or moving closed loop stands out of the noise: at rest "
+            "; ".join((*missing, ""))
+            + "no relay phase, step, pulse or moving closed loop stands out of the noise: at rest "
             "a controller's command only follows the noise of the measurement, which would give "
             "a wrong model; record an experiment, or name a part to be used all the same with "
             "--start and --end"
         )
     records = [record.part(stretch.first, stretch.last + 1) for stretch in stretches]
     if len(stretches) == 1 and len(records[0]) == len(record):
-        return records, []
+        return records, missing
     begins = record.time[[stretch.first for stretch in stretches]]
     ends = record.time[[stretch.last for stretch in stretches]]
-    return records, [
+    return records, missing + [
         f"experiment {number} of {len(records)}, {begin:g} s to {end:g} s: {stretch.reason}"
         for number, (begin, end, stretch) in enumerate(
             zip(begins, ends, stretches, strict=True), start=1
         )
     ]
+
+
+def _missing_rows(record: Record) -> list[str]:
+    """Return a note about the gaps in the rows of a table, if there are some."""
+    from relay_autotune.record.excitation import gaps_of
+
+    gaps = gaps_of(record)
+    if not gaps.before.size:
+        return []
+    told = f"gaps in the rows: {gaps.before.size}, the longest {gaps.longest:.3g} s"
+    if gaps.hidden.size:
+        end = record.time[gaps.hidden[0]]
+        told += (
+            f"; over {gaps.hidden.size} of them the command changed, the first time before "
+            f"{end:g} s, and nobody knows when: an experiment ends there, so log without gaps, or "
+            f"add a row at each change"
+        )
+    return [told]
 
 
 def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:

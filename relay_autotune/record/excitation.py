@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relay_autotune.arrays import FloatArray
+from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.record.cycles import follow_measurement, two_level_runs
 from relay_autotune.record.record import Input, Record, cached_on_record, roughness
 
@@ -33,6 +33,10 @@ _FEWEST_VALUES = 20
 # A break in the record: no sample for this time, and for a multiple of the usual interval.
 _BREAK_S = 60.0
 _BREAK_INTERVALS = 1000.0
+
+# A gap in the rows of a table, as a multiple of the usual interval. Where more than a tenth of the
+# intervals are longer than another multiple, a row was written when something changed.
+_GAP_INTERVALS, _REGULAR = 5.0, 1.5
 
 # Number of equal samples at an end of the measurement's range that means saturation, if the
 # measurement was a share of its range away within twice the time in which it crossed another
@@ -74,7 +78,7 @@ def find_experiments(record: Record) -> tuple[Stretch, ...]:
     A stretch includes the rest before and after it, which shows the operating point and the noise.
     Each rest is at most as long as the experiment itself, or ten times as long for steps and
     pulses.
-    A saturated measurement or a break ends an experiment.
+    A saturated measurement, a break, or a change of the command in a gap ends an experiment.
 
     :param record: a record of any origin.
     :returns: the stretches; empty if the command does not move the measurement.
@@ -83,6 +87,38 @@ def find_experiments(record: Record) -> tuple[Stretch, ...]:
     for first, last in _unbroken(record):
         found += _in_part(record, first, last)
     return tuple(found)
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """Gaps in the rows of a table.
+
+    :param before: index of the sample after each, shape (n,).
+    :param longest: s.
+    :param hidden: those over which the command changed, nobody knows when, shape (m,).
+    """
+
+    before: IntArray
+    longest: float
+    hidden: IntArray
+
+
+def gaps_of(record: Record) -> Gaps:
+    """Return the gaps in a table whose rows were written at a fixed interval.
+
+    :param record: a record of any origin, of two samples or more.
+    """
+    interval = np.diff(record.time)
+    usual = float(np.median(interval))
+    long = interval > _GAP_INTERVALS * usual
+    if not record.is_table or float(np.quantile(interval, 0.9)) > _REGULAR * usual:
+        long = np.zeros(interval.size, dtype=np.bool_)
+    before = np.flatnonzero(long) + 1
+    changes = np.diff(record.command) != 0.0
+    # A controller that moves the command at each row has moved it a little in each gap.
+    seldom = float(np.mean(changes)) < _CONTINUOUS
+    hidden = before[changes[before - 1] & seldom]
+    return Gaps(before, float(np.max(interval[long], initial=0.0)), hidden)
 
 
 def changes_within(u: Input, time: FloatArray) -> FloatArray:
@@ -136,6 +172,7 @@ def _unbroken(record: Record) -> list[tuple[int, int]]:
         return [(0, 0)]
     usual = float(np.median(interval))
     broken = interval > max(_BREAK_S, _BREAK_INTERVALS * usual)
+    broken[gaps_of(record).hidden - 1] = True
     kept = ~_saturated(y)
     apart = ~kept[1:] | ~kept[:-1] | broken
     begins = np.flatnonzero(kept & np.concatenate(([True], apart)))

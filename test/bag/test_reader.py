@@ -321,7 +321,8 @@ def test_a_damaged_chunk_is_left_out_and_said(tmp_path):
     data[data.index(encode_float64(150 % 19), data.index(encode_float64(18.0)) + 9000) + 5] ^= 255
     path.write_bytes(data)
     recording = read_experiments(tmp_path / "bag")
-    assert len(recording.experiments[0]) == 200
+    # Nobody knows when the command changed in it, so that an experiment ends there.
+    assert sum(map(len, recording.experiments)) == 200
     assert any("is damaged at byte" in n and "checksum" in n for n in recording.notes)
 
 

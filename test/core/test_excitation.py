@@ -15,7 +15,7 @@ from sampled_relay import simulate_sampled_relay
 from relay_autotune.analysis import analyse
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.excitation import find_experiments, resting_command
+from relay_autotune.record.excitation import find_experiments, gaps_of, resting_command
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
@@ -162,6 +162,36 @@ def test_where_nothing_was_recorded_an_experiment_ends():
     (first, second) = spans(broken)
     assert first[2] < 600.0
     assert second[1] > 1900.0
+
+
+def without(record: Record, low: float, high: float) -> Record:
+    """Return a table without the rows between two times [s]."""
+    kept = (record.time <= low) | (record.time >= high)
+    return Record(record.time[kept], record.measurement[kept], record.command[kept])
+
+
+def test_a_change_of_the_command_in_a_gap_of_a_table_ends_an_experiment():
+    """The row after the gap came up to its length late, and the model got too little dead time."""
+    whole = commanded([50.0, 150.0], [0.0, 1.0, 0.0])
+    assert gaps_of(without(whole, 100.0, 110.0)).hidden.size == 0
+    assert len(find_experiments(without(whole, 100.0, 110.0))) == 1
+    hit = without(whole, 145.0, 155.0)
+    gaps = gaps_of(hit)
+    assert hit.time[gaps.hidden].tolist() == [155.0]
+    assert gaps.longest == pytest.approx(10.0)
+    (first,) = find_experiments(hit)
+    assert hit.time[first.last] == 145.0
+    # Both changes are unknown.
+    assert not find_experiments(without(hit, 40.0, 52.0))
+
+
+def test_rows_that_were_written_when_something_changed_have_no_gaps():
+    whole = commanded([50.0, 150.0], [0.0, 1.0, 0.0], noise=0.0)
+    changed = np.abs(np.diff(np.round(whole.measurement, 2), prepend=-1.0)) > 0.0
+    kept = changed | (np.diff(whole.command, prepend=0.0) != 0.0)
+    record = Record(whole.time[kept], whole.measurement[kept], whole.command[kept])
+    assert np.max(np.diff(record.time)) > 20.0 * np.median(np.diff(record.time))
+    assert gaps_of(record).before.size == 0
 
 
 def test_a_saturated_stretch_is_left_out():
