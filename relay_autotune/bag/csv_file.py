@@ -9,6 +9,7 @@ What the file does not tell is guessed, and each guess is a note.
 from __future__ import annotations
 
 import csv
+import difflib
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -545,5 +546,10 @@ def _named(path: Path, names: Sequence[str], wanted: str) -> int:
             "each: change them in its header line"
         )
     if not fits:
-        raise NotThereError(f"{path} has no column {wanted!r}", f"its columns are {listed(names)}")
+        known = {without_unit(name).casefold(): name for name in names}
+        near = difflib.get_close_matches(wanted.casefold(), known, n=1)
+        meant = f"; did you mean {known[near[0]]!r}?" if near else ""
+        raise NotThereError(
+            f"{path} has no column {wanted!r}{meant}", f"its columns are {listed(names)}"
+        )
     return fits[0]

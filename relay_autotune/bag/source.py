@@ -192,7 +192,9 @@ class Source:
             known = (*_OTHERS, *_TABLES)
             told = next((what for head, what in known if start.startswith(head)), None)
             found = f"it is {told}" if told else f"it begins with {start[:8]!r}"
-            raise BagError(f"{self.path} is not {self._kind}: {found}")
+            raise BagError(
+                f"{self.path} is not {self._kind}: {found}; expected a bag or a CSV table"
+            )
         if len(start) < len(self._magic):
             raise BagError(
                 f"{self.path} holds only the first {len(start)} bytes of {self._kind}; "

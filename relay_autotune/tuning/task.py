@@ -22,6 +22,7 @@ from relay_autotune.process.model_set import ModelErrors, ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.quantities import check, quantity
+from relay_autotune.text import digits
 
 CONTROLLERS = ("auto", "pi", "pid")
 MS_RANGE = (1.2, 4.0)
@@ -221,6 +222,13 @@ def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:
             f"the noise alone moves the command by {noise:.3g} (standard deviation), "
             f"{100.0 * noise / options.amplitude:.0f} % of half the command's range; filter the "
             "measurement, or ask for PI"
+        )
+    model, period = task.model, options.sample_period
+    answers = model.dead_time + sum(abs(t) for t in model.time_constants)
+    if not model.integrators and 0.0 < answers < period:
+        found.append(
+            f"the controller runs every {digits(period, 3)} s, and the process answers within "
+            f"{digits(answers, 3)} s: is the sampling period in seconds?"
         )
     return tuple(found)
 

@@ -656,6 +656,8 @@ def test_one_function_reads_columns_of_a_bag_and_of_a_text():
     np.testing.assert_array_equal(read(text, [u])[u].values, columns[u].values)
     with pytest.raises(SelectionError, match="has no column 'nothing'"):
         read(text, ["nothing"])
+    with pytest.raises(SelectionError, match=re.escape(f"did you mean {y!r}?")):
+        read(text, ["temperature"])
 
 
 def test_the_readme_of_the_reader_runs(capsys, monkeypatch):

@@ -10,9 +10,10 @@ import math
 import pytest
 
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.gains import Controller
 from relay_autotune.process.structures import IPDT
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.tuning.task import DesignOptions, DesignTask
+from relay_autotune.tuning.task import DesignOptions, DesignTask, cautions
 
 
 @pytest.mark.parametrize(
@@ -51,3 +52,11 @@ def test_the_bound_on_the_complementary_sensitivity_follows_the_process():
 def test_a_held_sample_lags_by_half_a_period():
     assert DesignOptions(sample_period=0.2, loop_delay=0.3).added_delay == pytest.approx(0.4)
     assert DesignTask(model=IPDT.build((1.0, 1.0))).options.added_delay == 0.0
+
+
+@pytest.mark.parametrize(("period", "asks"), [(0.1, False), (100.0, True)])
+def test_a_period_in_milliseconds_is_asked_about(period, asks):
+    process = TransferFunction(0.6, time_constants=(40.0, 12.0), dead_time=8.0)
+    task = DesignTask(model=process, options=DesignOptions(sample_period=period))
+    said = cautions(task.loop(Controller(0.5, 60.0)).performance(), task)
+    assert any("is the sampling period in seconds?" in each for each in said) is asks

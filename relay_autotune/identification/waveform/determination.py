@@ -154,10 +154,10 @@ def _for_noise(found: Identification, missing: set[str], tests: _Tests) -> list[
     if not 1.0 < widest <= _MOST_TIMES:
         return []
     larger, more = ("an amplitude", "cycles") if tests.relay else ("steps", "of them")
-    return [
-        f"{larger} {widest:.1f} times as large, or {math.ceil(widest**2)} times as many {more}, "
-        "would narrow every interval enough"
-    ]
+    longer = f"{math.ceil(widest**2)} times as many {more}"
+    if widest >= 1.05:
+        longer = f"{larger} {widest:.1f} times as large, or {longer},"
+    return [f"{longer} would narrow every interval enough"]
 
 
 def with_what_is_determined(
