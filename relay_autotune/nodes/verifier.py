@@ -281,14 +281,18 @@ class Verifier:
         """Put the gains on trial, make the steps, and return verdict and reason."""
         tried = await self._verifiable(request)
         self._require_on()
-        await self._once_ready(self._require_samples, time.monotonic() + request.patience)
+        patience = request.patience
+        await self._once_ready(self._require_samples, time.monotonic() + patience)
         if tried.new is not None:
             await self._on_trial(tried)
             self._require_on()
             shown = self._recent[-1][0] - self._recent[0][0]
             settles = tried.settles if math.isfinite(tried.settles) else shown
             await self._settled(_SETTLES * settles)
-        begun, patience = time.monotonic(), request.patience
+            # A slow loop shows its rest no sooner.
+            patience = max(patience, self._pace() * settles)
+            self._until += patience - request.patience
+        begun = time.monotonic()
         rest, period = await self._once_ready(
             lambda: self._at_rest(tried.steps, time.monotonic() - begun < 0.5 * patience),
             begun + patience,
