@@ -211,7 +211,8 @@ MODEL_CHECKS = (
         doubtful=0.1,
         failed=0.5,
         sentence="{value} of the measurement's variance is not explained",
-        remedy="keep other inputs constant, or use a larger amplitude",
+        remedy="keep other inputs constant, see that the actuator reaches its commands, or use a "
+        "larger amplitude",
         measure=_share,
     ),
     Check(
