@@ -28,7 +28,6 @@ from relay_autotune.identification.waveform.separable import (
     information_criterion,
     left_in_simulation,
     left_of,
-    predicted_cost,
     pulse,
     refine,
 )
@@ -417,22 +416,15 @@ class FitContext:
         late = candidate.model.dead_time > _LATEST * self.length
         return self.sign * candidate.model.process_sign >= 0 and (self.held or not late)
 
-    def refit(
-        self, candidate: Candidate, colour: Colour | None, hopeless: float = math.inf
-    ) -> Candidate | None:
+    def refit(self, candidate: Candidate, colour: Colour | None) -> Candidate | None:
         """Fit a candidate in another colour, from where it is.
 
         :param candidate: of this context's samples.
         :param colour: of the noise; None: white.
-        :param hopeless: score beyond which it is given up, if not even a model that is linear in
-            its parameters reaches it.
         """
         problem = replace(candidate.problem, colour=colour)
-        state = evaluate(problem, candidate.state.theta)
-        linear = replace(state, cost=predicted_cost(problem, state))
-        if self._score(problem, linear, candidate.model) > hopeless:
-            return None
-        return self.candidate(problem, refine(problem, state, tolerance=TRIAL, most=STEPS))
+        state = refine(problem, candidate.state.theta, tolerance=TRIAL, most=STEPS)
+        return self.candidate(problem, state)
 
     def _family(self, name: str, order: int) -> Iterator[Structure]:
         """Yield the structures of a name that there are samples enough for."""

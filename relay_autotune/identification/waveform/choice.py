@@ -332,15 +332,8 @@ def names_near(fit: Fit) -> list[str]:
 
 def _in(colour: Colour | None, found: list[Candidate], context: FitContext) -> list[Candidate]:
     """Return candidates fitted in one colour, the best first."""
-    again: list[Candidate] = []
-    most = math.inf
-    for candidate in sorted(found, key=lambda c: c.score):
-        plain = candidate.structure.name in PLAIN
-        fitted = context.refit(candidate, colour, math.inf if plain else most)
-        if fitted is not None:
-            again.append(fitted)
-            most = min(most, fitted.score + _HOPELESS)
-    return sorted(again, key=lambda c: c.score)
+    again = (context.refit(c, colour) for c in found)
+    return sorted((c for c in again if c is not None), key=lambda c: c.score)
 
 
 def _colour(problem: Problem, state: Trial) -> Colour | None:

@@ -488,15 +488,15 @@ def left_of(y: FloatArray, rows: FloatArray) -> FloatArray:
 def left_in_simulation(problem: Problem, state: Trial) -> tuple[float, float]:
     """Return the rms that a model leaves in simulation, and that of what it is to explain.
 
-    Offset, drift and past are fitted anew; the model keeps its own coefficients.
+    All beside the model is fitted anew; the model keeps its own coefficients.
 
     :param problem: may hold other samples than those that the model was fitted to.
     :param state: the model.
     """
-    problem = replace(problem, colour=None)
-    y, nuisances = problem.seen(problem.y), problem.nuisances(state.theta)
-    modelled = state.coefficients @ problem.seen(problem.columns(state.theta)[0])
-    left, total = left_of(y - modelled, nuisances), left_of(y, nuisances)
+    problem, own = replace(problem, colour=None), len(problem.structure.powers)
+    columns, y = problem.seen(problem.columns(state.theta)[0]), problem.seen(problem.y)
+    left = left_of(y - state.coefficients[:own] @ columns[:own], columns[own:])
+    total = left_of(y, problem.nuisances(state.theta))
     return math.sqrt(float(np.mean(left**2))), math.sqrt(float(np.mean(total**2)))
 
 
