@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError, look_up
-from relay_autotune.process.transfer_function import (
+from relay_autotune.process.factors import (
     DEAD_TIME,
     GAIN,
     INVERSE,
@@ -32,9 +32,9 @@ from relay_autotune.process.transfer_function import (
     Lag,
     Parameter,
     Quadratic,
-    TransferFunction,
     exactly,
 )
+from relay_autotune.process.transfer_function import TransferFunction
 
 GENERAL = "general"
 

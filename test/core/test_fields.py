@@ -31,8 +31,9 @@ from relay_autotune.identification.result import (
     Validation,
 )
 from relay_autotune.loop.gains import Gains, Performance
+from relay_autotune.process.factors import Quadratic
 from relay_autotune.process.structures import TABLE, Structure
-from relay_autotune.process.transfer_function import Quadratic, TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import ResultField, result_fields
 from relay_autotune.record.cycles import LimitCycle
 from relay_autotune.record.record import Cycle, RelaySettings

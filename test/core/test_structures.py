@@ -21,6 +21,7 @@ from relay_autotune.identification.waveform.rational import (
     responses,
 )
 from relay_autotune.identification.waveform.starts import is_unobservable
+from relay_autotune.process.factors import Denominator, Lag, Quadratic
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import (
@@ -35,7 +36,7 @@ from relay_autotune.process.structures import (
     UNSTABLE_FOPDT,
     UNSTABLE_SOPDT,
 )
-from relay_autotune.process.transfer_function import Denominator, Lag, Quadratic, TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 

@@ -13,9 +13,9 @@ import math
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
+from relay_autotune.process.factors import Denominator, Quadratic
 from relay_autotune.process.response import Modes, recursion
 from relay_autotune.process.structures import FOPDT, Structure
-from relay_autotune.process.transfer_function import Denominator, Quadratic
 from relay_autotune.record.record import Input, PiecewiseConstant, PiecewiseLinear
 
 _LOG_STEP = 1.0

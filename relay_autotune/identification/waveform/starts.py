@@ -26,9 +26,10 @@ from relay_autotune.identification.waveform.separable import (
     pulse,
     refine,
 )
+from relay_autotune.process.factors import Quadratic
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import Structure
-from relay_autotune.process.transfer_function import Quadratic, TransferFunction
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.excitation import changes_within
 from relay_autotune.record.record import Input, PiecewiseConstant
