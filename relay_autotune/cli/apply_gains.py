@@ -20,7 +20,7 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, finite, guarded_in_graph, say
@@ -196,15 +196,15 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
     if not agreed:
         say(PROGRAM, "nothing was changed")
         return False, ""
-    if options.accept_doubtful:
-        client.set_values(client.name, {"accept_doubtful": True})
+    accepting = client.accepting_doubtful() if options.accept_doubtful else nullcontext()
     if options.no_verify:
-        client.ask("apply")
+        with accepting:
+            client.ask("apply")
         if options.stays:
             tell("gains", f"in force, not verified; {PROGRAM} --verify-only makes the step")
         return True, ""
     new = None if options.verify_only else gains
-    with noted(lambda text: say(PROGRAM, text)) as (shown, leave):
+    with accepting, noted(lambda text: say(PROGRAM, text)) as (shown, leave):
         result, entries = verified(
             client, step, shown, leave, new, noise,
             load=options.load, patience=options.wait, stays=options.stays,

@@ -216,7 +216,9 @@ class GainsClient(LoopClient):
         try:
             yield
         finally:
-            self.set_values(self.name, before)
+            # A node that has gone has lost the parameter, too.
+            with suppress(LoopError):
+                self.set_values(self.name, before)
 
     def steps(self) -> StepsHere:
         """Return the steps that may prove gains here."""

@@ -351,11 +351,18 @@ def test_doubtful_gains_are_never_applied_by_themselves(rig: Rig) -> None:
     publish("again", PidGains.VERDICT_DOUBTFUL, 0.5)
     rig.until(lambda: "gains of again wait" in controller.log, "the doubtful gains")
     assert parameters_of(rig) == [0.6, 0.8]
+    # The command takes them, and leaves the node as it was.
+    by_command = rig.start_command("apply_gains", "--yes", "--no-verify", "--accept-doubtful")
+    by_command.wait()
+    assert parameters_of(rig) == [0.5, 0.8]
+    assert rig.values("controller_node", "accept_doubtful") == [False]
+    publish("at last", PidGains.VERDICT_DOUBTFUL, 0.55)
+    rig.until(lambda: "gains of at last wait" in controller.log, "the doubtful gains")
     told = Parameter("accept_doubtful", value=True).to_parameter_msg()
     request = SetParameters.Request(parameters=[told])
     assert rig.call(SetParameters, "controller_node/set_parameters", request).results[0].successful
     assert trigger(rig, "apply").success
-    assert parameters_of(rig) == [0.5, 0.8]
+    assert parameters_of(rig) == [0.55, 0.8]
 
 
 def test_gains_go_to_another_node_all_or_none(rig: Rig) -> None:
