@@ -267,7 +267,9 @@ class Proof:
             }
             if self.rate is not None:
                 values |= parameters_of_law(self.rate.law.name, self.rate.period)
-            topics = {"measurement": options.measurement}
+            # identifier_node's own gains, which may come late, are not the ones to be proven.
+            gains = f"{loop.space}/gains_of_{CONTROLLER}"
+            topics = {"measurement": options.measurement, "pi_gains": gains}
             arguments = ros_arguments(loop.space, topics, values)
             loop.nodes.start(CONTROLLER, arguments)
             try:

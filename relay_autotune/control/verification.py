@@ -247,7 +247,7 @@ def _visible(
     """
     deviation = predicted[: time.size]
     expected = describe(time, deviation, step)
-    scale = abs(step.setpoint) or expected.largest
+    scale = step.setpoint or expected.largest
     other = run_loop(
         control, scaled(model, _SLIGHTLY), time, setpoint=step.setpoint, load=step.load
     ).measurement
@@ -277,7 +277,7 @@ def _visible(
         seen = np.maximum(np.abs(error[:, None] + ratio * nodes) - floor * ratio, 0.0)
         mean = seen @ weights
         spread = math.sqrt(float(np.sum(seen**2 @ weights - mean**2)) / each)
-        room = IAE_RATIO * expected.iae / scale / interval - float(mean.sum())
+        room = IAE_RATIO * expected.iae / abs(scale) / interval - float(mean.sum())
         # A gain is seen with this standard deviation of its logarithm.
         unsure = ratio / math.sqrt(max(slope * each, 1e-300))
         rare = [room / spread, *(edge / unsure for edge in edges)]
@@ -290,7 +290,7 @@ def _visible(
         low, high = (middle, high) if chance(math.exp(middle)) < allowed else (low, middle)
     # A step of this height has a response of the size of `scale`.
     height = abs(step.setpoint or step.load)
-    return height / (scale * math.exp(low))
+    return height / (abs(scale) * math.exp(low))
 
 
 def _edge(control: Control, model: TransferFunction, end: float) -> float:

@@ -191,7 +191,9 @@ class GainsClient(LoopClient):
         if self.has(gains):
             raise LoopError("these gains are in force already")
         self.call(Trigger, f"{self.name}/discard", Trigger.Request())
-        offer = self._node.create_publisher(PidGains, self._resolved("pi_gains"), quality.RESULT)
+        kind = "relay_autotune_msgs/msg/PidGains"
+        topic = self._topic_of(self.name, "pi_gains", kind, published=False)
+        offer = self._node.create_publisher(PidGains, topic, quality.RESULT)
         try:
             offer.publish(message)
             yield gains

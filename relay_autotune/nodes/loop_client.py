@@ -450,10 +450,10 @@ class LoopClient:
         there: list[tuple[str, list[str]]] = []
 
         def is_known() -> bool:
-            # Its services may be known before its name is.
+            # Its services may be known before its name and its topics are.
             with suppress(NodeNameNonExistentError):
                 there[:] = ends(name, space or "/")
-            return bool(there)
+            return any(type_name in types for _, types in there)
 
         self.wait(is_known, ANSWER_WITHIN)
         found = [end for end, types in there if type_name in types and end not in others]

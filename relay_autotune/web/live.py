@@ -53,6 +53,8 @@ class PageCommand:
 
     def __post_init__(self) -> None:
         check(self, TuningError)
+        # JSON has 3 for a step of 3.0, and a parameter takes no whole number for it.
+        object.__setattr__(self, "step", float(self.step))
         for name, value in self.settings.items():
             for number in value if isinstance(value, list) else [value]:
                 if not (isinstance(number, int | float) and math.isfinite(number)):

@@ -491,7 +491,7 @@ def application(page: Page) -> Application:
         [
             (r"/socket", _Socket, given),
             (r"/report.html", _Report, given),
-            (r"/gains/([a-z_]+)", _Export, given),
+            (r"/gains/([a-z0-9_]+)", _Export, given),
             (r"/([a-z.]*)", _Static, given),
         ],
         websocket_max_message_size=_LARGEST_QUESTION,

@@ -326,6 +326,13 @@ def test_noise_does_not_change_the_overshoot_that_is_told():
     assert abs(np.mean(noisy) - clean) < noise_std / step.setpoint
 
 
+def test_a_step_down_is_seen_as_well_as_one_up():
+    """Its overshoot had the wrong sign, so that no step was large enough."""
+    up, down = (plan(Control(GAINS), PROCESS, Step(setpoint=h), 0.05) for h in (0.5, -0.5))
+    assert down.visible == pytest.approx(up.visible, rel=1e-6)
+    assert 0.0 < up.visible < 100.0
+
+
 def test_gains_that_are_unstable_on_the_model_are_not_tried():
     with pytest.raises(TuningError, match="unstable loop"):
         plan(Control(Controller(kc=20.0, ti=1.0)), PROCESS, Step(setpoint=1.0), 0.05)

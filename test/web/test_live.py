@@ -133,6 +133,10 @@ def test_figures_are_told_when_they_change_and_to_a_page_that_is_opened_late():
     assert live.everything()["shown"] == {"proof": [1]}
 
 
+def test_a_whole_number_is_a_step():
+    assert isinstance(PageCommand("verify", step=3).step, float)
+
+
 @pytest.mark.parametrize(
     "wish",
     [

@@ -208,6 +208,9 @@ def test_gains_are_kept_in_a_file(url):
     assert status == 200, text
     assert headers["Content-Disposition"] == 'attachment; filename="simple_pid.py"'
     assert "from simple_pid import PID" in text
+    asked = quote('{"law": "iec_61131_3_pid", "sample_period": 0.2}')
+    status, _, text = get(url + f"gains/iec_61131_3_pid?asked={asked}")
+    assert status == 200, text
 
 
 def test_the_report_has_the_gains_that_were_shaped(url, subject, monkeypatch):
