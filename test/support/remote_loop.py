@@ -17,6 +17,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
+from relay_autotune.reasons import Code
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, TransferFunction
 
@@ -168,8 +169,9 @@ class Loop:
 
         def at_rest() -> tuple[int, Any] | None:
             status, result = self.ask_for_proof(during, request)
-            # The time to settle depends on the load of the machine.
-            return None if "the loop is not at rest" in result.reason else (status, result)
+            # How soon the loop runs and has settled depends on the load of the machine.
+            early = Code.NOT_AT_REST, Code.FEW_SAMPLES
+            return None if result.why.code in early else (status, result)
 
         return self.rig.until(at_rest, "a loop at rest")
 
