@@ -58,7 +58,7 @@ from relay_autotune.cli.tune_view import (
 )
 from relay_autotune.control.controller import Control
 from relay_autotune.control.step_choice import StepChoice
-from relay_autotune.control.verification import noise_of
+from relay_autotune.control.verification import SETTLES, noise_of
 from relay_autotune.errors import RelayAutotuneError, SelectionError, TuningError
 from relay_autotune.exchange.export import (
     EXPORTS,
@@ -221,7 +221,7 @@ class Proof:
         # How long the loop takes to settle with the gains, and all of it [s].
         known = math.isfinite(gains.settling_time)
         self._settles = gains.settling_time if known else wanted.duration
-        self._takes = wanted.duration + 2.5 * self._settles
+        self._takes = wanted.duration + (SETTLES + 1.0) * self._settles
         self._expected = choice.expected(wanted)
 
     @property

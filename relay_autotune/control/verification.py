@@ -22,6 +22,9 @@ from relay_autotune.reasons import Code, Reason
 
 # A response has settled when it stays within this part of its largest deviation.
 SETTLED = 0.05
+# After a tune the loop begins up to twice the step away from rest, and what is left of that after
+# the settling time of a step changed the gain that the next step shows by a tenth: settling times.
+SETTLES = 1.5
 # A step lasts for a multiple of the predicted settling time, and for a least number of samples.
 WATCHED = 1.6
 LEAST_SAMPLES = 30

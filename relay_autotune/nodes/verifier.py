@@ -18,7 +18,7 @@ from rclpy.task import Future
 
 from relay_autotune.control.controller import LONGEST_TIME, Control
 from relay_autotune.control.gains_history import GainSet
-from relay_autotune.control.verification import Plan, Step, compare, plan
+from relay_autotune.control.verification import SETTLES, Plan, Step, compare, plan
 from relay_autotune.errors import NotReadyError, RelayAutotuneError
 from relay_autotune.exchange.fields import float64_array
 from relay_autotune.exchange.messages import fill_reason, reason_from_message, set_stamp
@@ -41,9 +41,6 @@ _LEAST_BEFORE = 10
 _STILL = 0.1
 # Slow noise moves the mean of a few samples by this many standard deviations at most.
 _SLOW_NOISE = 4.0
-# After a tune the loop begins up to twice the step away from rest, and what is left of that after
-# the settling time of a step changed the gain that the next step shows by a tenth: settling times.
-_SETTLES = 1.5
 # Longest silence of the measurement: a time [s], or a number of usual intervals if that is longer.
 _SILENCE = 2.0
 _SILENT_INTERVALS = 20.0
@@ -288,7 +285,7 @@ class Verifier:
             self._require_on()
             shown = self._recent[-1][0] - self._recent[0][0]
             settles = tried.settles if math.isfinite(tried.settles) else shown
-            await self._settled(_SETTLES * settles)
+            await self._settled(SETTLES * settles)
             # A slow loop shows its rest no sooner.
             patience = max(patience, self._pace() * settles)
             self._until += patience - request.patience

@@ -171,6 +171,11 @@ class TransferFunction:
         return len(self.time_constants) + max(self.integrators, 0)
 
     @property
+    def response_time(self) -> float:
+        """Dead time and lags together, about the time that it takes to answer [s]."""
+        return self.dead_time + sum(abs(t) for t in self.time_constants)
+
+    @property
     def is_stable(self) -> bool:
         """True if every pole lies in the open left half plane."""
         return self.integrators <= 0 and all(t.real > 0.0 for t in self.time_constants)

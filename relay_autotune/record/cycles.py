@@ -282,7 +282,7 @@ TOLERANCE = 0.02
 
 # A pause between samples is a gap if it is longer than 5 median intervals and than a twentieth of
 # the cycle.
-_GAP_INTERVALS = 5.0
+GAP_INTERVALS = 5.0
 _GAP_SHARE = 0.05
 
 # Allowance of `agree` for noise, in standard deviations.
@@ -353,7 +353,7 @@ def cycle_from_samples(
         time_to_peak_min=float(time[bottom] - time[lowered]),
         mean_measurement=mean_measurement,
         mean_command=mean_command,
-        disturbed=gap > max(_GAP_INTERVALS * float(np.median(interval)), _GAP_SHARE * period),
+        disturbed=gap > max(GAP_INTERVALS * float(np.median(interval)), _GAP_SHARE * period),
     )
 
 

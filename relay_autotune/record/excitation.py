@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from relay_autotune.arrays import FloatArray, IntArray
-from relay_autotune.record.cycles import follow_measurement, two_level_runs
+from relay_autotune.record.cycles import GAP_INTERVALS, follow_measurement, two_level_runs
 from relay_autotune.record.record import Input, Record, cached_on_record, roughness
 
 # Least number of switches between two levels for a relay phase: two whole cycles.
@@ -34,9 +34,9 @@ _FEWEST_VALUES = 20
 _BREAK_S = 60.0
 _BREAK_INTERVALS = 1000.0
 
-# A gap in the rows of a table, as a multiple of the usual interval. Where more than a tenth of the
-# intervals are longer than another multiple, a row was written when something changed.
-_GAP_INTERVALS, _REGULAR = 5.0, 1.5
+# Where more than a tenth of the intervals in a table are longer than this multiple of the usual
+# one, a row was written when something changed.
+_REGULAR = 1.5
 
 # Number of equal samples at an end of the measurement's range that means saturation, if the
 # measurement was a share of its range away within twice the time in which it crossed another
@@ -103,6 +103,7 @@ class Gaps:
     hidden: IntArray
 
 
+@cached_on_record
 def gaps_of(record: Record) -> Gaps:
     """Return the gaps in a table whose rows were written at a fixed interval.
 
@@ -110,7 +111,7 @@ def gaps_of(record: Record) -> Gaps:
     """
     interval = np.diff(record.time)
     usual = float(np.median(interval))
-    long = interval > _GAP_INTERVALS * usual
+    long = interval > GAP_INTERVALS * usual
     if not record.is_table or float(np.quantile(interval, 0.9)) > _REGULAR * usual:
         long = np.zeros(interval.size, dtype=np.bool_)
     before = np.flatnonzero(long) + 1

@@ -224,11 +224,10 @@ def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:
             "measurement, or ask for PI"
         )
     model, period = task.model, options.sample_period
-    answers = model.dead_time + sum(abs(t) for t in model.time_constants)
-    if not model.integrators and 0.0 < answers < period:
+    if not model.integrators and 0.0 < model.response_time < period:
         found.append(
             f"the controller runs every {digits(period, 3)} s, and the process answers within "
-            f"{digits(answers, 3)} s: is the sampling period in seconds?"
+            f"{digits(model.response_time, 3)} s: is the sampling period in seconds?"
         )
     return tuple(found)
 

@@ -152,7 +152,7 @@ def _difference(found: Identification, record: Record) -> Difference | None:
     moved = ((past[:, :-1] - past[:, 1:]) / np.diff(edges)).T
     if not np.any(moved):
         return None
-    whole = model.dead_time + sum(abs(t) for t in model.time_constants) or record.duration
+    whole = model.response_time or record.duration
     # Of what is faster than the samples they tell nothing.
     whole = max(whole, shortest)
     lag = np.sqrt(np.maximum(edges[:-1], 0.5 * shortest) * edges[1:])

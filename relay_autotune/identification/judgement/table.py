@@ -41,7 +41,7 @@ def _fed_back(evidence: Evidence) -> Measured | None:
 
 def _resolution(evidence: Evidence) -> Measured | None:
     model = evidence.found.model
-    answer = model.dead_time + sum(abs(t) for t in model.time_constants)
+    answer = model.response_time
     return Measured(evidence.record.interval / answer) if answer > 0.0 else None
 
 

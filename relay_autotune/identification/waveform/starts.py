@@ -70,8 +70,7 @@ def is_unobservable(
     swing = _SAMPLES_A_SWING * interval / (2.0 * math.pi)
     if any(c.imag != 0.0 and abs(c) < swing for c in model.time_constants):
         return True
-    whole = model.dead_time + sum(abs(c) for c in model.time_constants)
-    if not model.integrators and whole < _SHORTEST_RESPONSE * interval:
+    if not model.integrators and model.response_time < _SHORTEST_RESPONSE * interval:
         return True
     if any(abs(zero) > LASTING * length for zero in model.zeros):
         return True
