@@ -98,6 +98,12 @@ _REACH = (
     "quarter of the amplitude stood clear of the noise: look whether it goes from {low:g} to "
     "{high:g}"
 )
+# A limit is passed while settling, or once the relay's levels move the process.
+_MOVED_BY = (
+    "[, and only {baseline:g} u was commanded: that is not the present command, or a load came; "
+    "set the command at which the process rests][: give a smaller amplitude than "
+    "{amplitude:.3g} u, or wider limits if the plant allows]"
+)
 # Where a running experiment was when something from outside ended it.
 _PLACE = " (at {ended_at:.6g} s, {where})"
 _OPTIONAL = re.compile(r"\[(.*?)\]")
@@ -247,17 +253,20 @@ class Code(enum.IntEnum):
     )
     """A sensor that publishes only on change has stopped, or the process no longer moves."""
     OUTSIDE_LIMITS = _Row(
-        116, "the measurement {value:g} at {time:g} s is outside its limits, {low:g} to {high:g}"
+        116,
+        "the measurement {value:g} at {time:g} s is outside its limits, {low:g} to {high:g}"
+        f"{_MOVED_BY}",
     )
-    """The measurement reached a limit: take a smaller amplitude, or wider limits if the plant
-    allows."""
+    """The measurement reached a limit. While settling: the baseline is not the command at which
+    the process rested; set that one. Later: take a smaller amplitude, or wider limits if the
+    plant allows."""
     TOO_FAR = _Row(
         117,
         "the measurement {value:g} at {time:g} s is {away:g} away from the set-point, more than "
-        "max_deviation, {most:g}",
+        f"max_deviation, {{most:g}}{_MOVED_BY}",
     )
-    """The measurement swung further than allowed: take a smaller amplitude, or a larger
-    max_deviation."""
+    """The measurement swung further than allowed: as code 116, with a larger max_deviation for
+    wider limits."""
     MAX_DURATION = _Row(
         118, "max_duration {limit:g} s was over {where}", "allow more time or fewer cycles"
     )

@@ -451,7 +451,9 @@ class TopicLoop(Loop):
     @property
     def _rests_elsewhere(self) -> bool:
         """Whether the process did not rest at the command that was said to be the present one."""
-        return bool(self.client.result.why.code == Code.NOT_AT_BASELINE)
+        why = reason_from_message(self.client.result.why)
+        at_limit = why.code is Code.OUTSIDE_LIMITS and "baseline" in why.values
+        return at_limit or why.code is Code.NOT_AT_BASELINE
 
     @cached_property
     def left_its_limits(self) -> bool:

@@ -48,7 +48,7 @@ from relay_autotune.experiment.phases import (
 )
 from relay_autotune.experiment.relay_law import Levels
 from relay_autotune.experiment.switching import Switching
-from relay_autotune.reasons import NONE, Code, Reason, other
+from relay_autotune.reasons import NONE, Code, Reason, Value, other
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
 
 _BASELINE = SafePolicy()
@@ -430,11 +430,15 @@ class RelayExperiment:
         """Return the end of the experiment if the last sample passes a limit."""
         p = self.parameters
         low, high = p.measurement_min, p.measurement_max
+        # What has moved the process.
+        by: dict[str, Value] = {"baseline": self.baseline}
+        if self.state is not State.SETTLING:
+            by = {"amplitude": self._levels.amplitude}
         if not low <= y <= high:
-            why = Code.OUTSIDE_LIMITS(value=y, time=t, low=low, high=high)
+            why = Code.OUTSIDE_LIMITS(value=y, time=t, low=low, high=high, **by)
             return Ended(State.ABORTED, why)
         if p.max_deviation > 0.0 and (away := abs(y - self.facts.setpoint)) > p.max_deviation:
-            why = Code.TOO_FAR(value=y, time=t, away=away, most=p.max_deviation)
+            why = Code.TOO_FAR(value=y, time=t, away=away, most=p.max_deviation, **by)
             return Ended(State.ABORTED, why)
         if 0.0 < p.max_duration < t:
             return failed(Code.MAX_DURATION(limit=p.max_duration, where=self._phase.where))

@@ -60,7 +60,7 @@ from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import Verdict
 from relay_autotune.web.live import Live, PageCommand
 from relay_autotune_msgs.action import Tune
-from relay_autotune_msgs.msg import PidGains, Reason
+from relay_autotune_msgs.msg import PidGains
 
 TOPICS = ("--measurement", "/a", "--command", "/b")
 
@@ -966,25 +966,35 @@ def test_a_launch_file_starts_the_controller_with_limits_and_topics() -> None:
 
 
 @pytest.mark.parametrize(
-    ("code", "outside", "left_at", "next_step"),
+    ("why", "outside", "left_at", "next_step"),
     [
-        (Code.NOT_AT_BASELINE, False, "not the one at", "once it rests"),
-        (Code.OUTSIDE_LIMITS, True, "look whether", "once it rests"),
-        (Code.NODE_FAILED, False, "the plant is left at", "report it"),
-        (Code.CANCELLED, False, "the plant is left at the safe command 1040 u", "run it again"),
+        (core.Reason(Code.NOT_AT_BASELINE), False, "not the one at", "once it rests"),
+        (core.Reason(Code.OUTSIDE_LIMITS), True, "look whether", "once it rests"),
+        # It left them while nothing but the command that was given went out.
+        (
+            core.Reason(Code.OUTSIDE_LIMITS, (("baseline", 1040.0),)),
+            True,
+            "not the one at",
+            "once it rests",
+        ),
+        (core.Reason(Code.NODE_FAILED), False, "the plant is left at", "report it"),
+        (
+            core.Reason(Code.CANCELLED),
+            False,
+            "the plant is left at the safe command 1040 u",
+            "run it again",
+        ),
     ],
 )
 def test_after_an_end_that_would_come_again_the_same_command_is_not_offered_again(
-    code, outside, left_at, next_step
+    why, outside, left_at, next_step
 ):
     words = ["--measurement", "/y", "--command", "/u", "--at", "1040", "--within", "3", "9"]
     parser = tune_loop._parser()
     given = parser.parse_args(words)
     given.typed = words
-    result = SimpleNamespace(
-        why=Reason(code=code), outcome=2, ABORTED=2, COMPLETED=1,
-        gains=SimpleNamespace(experiment_id=""),
-    )  # fmt: skip
+    # The sentence lacks the values that matter to nobody here.
+    result = ended(replace(why, said="it ended"))
     last = np.array([5.0, 9.1 if outside else 6.2])
     client: Any = SimpleNamespace(
         result=result, record=lambda patience: SimpleNamespace(measurement=last),

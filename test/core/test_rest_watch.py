@@ -141,3 +141,19 @@ def test_slow_noise_is_told_by_its_scatter_about_a_line():
     assert np.mean(moved > allowed) > 0.9
     scatter = np.array([rest_state(samples, y, 50).noise_std for y in slow])
     assert np.mean(moved < 4.0 * scatter) > 0.8
+
+
+def test_a_limit_names_the_command_that_was_wrong_or_the_amplitude_that_was_too_large():
+    def end(baseline: float) -> str:
+        plant = VirtualProcess(PROCESS, rest_measurement=6.0, rest_command=1200.0)
+        limits = ExperimentParameters(amplitude=40.0, measurement_min=5.8, measurement_max=6.2)
+        tune = RelayExperiment(limits, baseline, before=[6.0] * 50)
+        k = 0
+        while not tune.finished:
+            plant.command(tune.step(k * PERIOD, plant.measure(k * PERIOD)), k * PERIOD)
+            k += 1
+        assert tune.outcome is Outcome.ABORTED
+        return tune.reason
+
+    assert "give a smaller amplitude than 40 u, or wider limits" in end(1200.0)
+    assert "only 0 u was commanded: that is not the present command" in end(0.0)
