@@ -201,6 +201,7 @@ def live_tune(picture: Path, width: int = 1000, height: int = 720) -> dict[str, 
         follow("tuning")
         look(_STILL)
         tap("#prove")
+        tab.wait("document.querySelector('#question').open", _TUNED_WITHIN)
         tap("#question-yes")
         follow("verifying")
         tab.wait("!document.querySelector('#proof').hidden")

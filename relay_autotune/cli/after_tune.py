@@ -209,11 +209,12 @@ class Proof:
         self.noise_std = noise_of(record.noise_std, result.transfer_function.residual_rms)
         model = transfer_function_from_message(result.transfer_function)
         choice = StepChoice(record, model, self._within, self._commands, self.noise_std)
+        self._choice = choice
         if not (step := options.step or choice.best):
             raise TuningError("the limits leave no room for a step: widen --within")
         gains = gains_from_message(self._message)
         self.rate = rate_of(gains.law, gains.law_period)
-        control = Control(gains, self.rate)
+        self._control = control = Control(gains, self.rate)
         self.allowed = choice.allowed(choice.plan(control, 1.0))
         self.step: float = options.step or self.allowed.nearest(step)
         self.allowed.require(self.step)
@@ -222,11 +223,15 @@ class Proof:
         known = math.isfinite(gains.settling_time)
         self._settles = gains.settling_time if known else wanted.duration
         self._takes = wanted.duration + (SETTLES + 1.0) * self._settles
-        self._expected = choice.expected(wanted)
 
-    @property
-    def plan(self) -> str:
-        """What will move, how far and how long."""
+    def plan(self, step: float) -> str:
+        """Return what will move, how far and how long.
+
+        :param step: of the set-point [y].
+        :raises TuningError: if it is not allowed.
+        """
+        self.allowed.require(step)
+        expected = self._choice.expected(self._choice.plan(self._control, step))
         options, commands = self._loop.options, self._commands
         rest, runs = self._rest, ""
         if self.rate is not None:
@@ -234,14 +239,14 @@ class Proof:
         return (
             f"A controller_node of this command{runs} takes the loop at "
             f"{rest.setpoint:.6g} y and {rest.baseline:.6g} u, moves the set-point of "
-            f"{options.measurement} by {self.step:+g} y and back, and ends at "
+            f"{options.measurement} by {step:+g} y and back, and ends at "
             f"{rest.baseline:.6g} u after about {duration(self._takes)}. {options.command} is "
-            f"expected {self._expected}, never beyond "
+            f"expected {expected}, never beyond "
             f"{commands.low:g} to {commands.high:g} u."
         )
 
     @contextmanager
-    def _controller(self, doubtful: bool) -> Iterator[GainsClient]:
+    def _started(self, doubtful: bool) -> Iterator[GainsClient]:
         """Start a controller_node in front of relay_node, and end it with the block.
 
         :param doubtful: whether the gains are.
@@ -295,7 +300,7 @@ class Proof:
         """
         self.allowed.require(step)
         patience = max(_TIMES_SETTLING * self._settles, _REST_WITHIN)
-        with self._controller(doubtful) as controller:
+        with self._started(doubtful) as controller:
             tell(f"starting {CONTROLLER}")
             controller.find(START_WITHIN, leave)
             with controller.offered(self._message) as gains:
@@ -591,7 +596,9 @@ class AfterTune(Tuned):
             proof = Proof(self)
         step = proof.step
         if asks:
-            question = f"Prove the gains now? {proof.plan} Ctrl-C ends it at once, likewise."
+            question = (
+                f"Prove the gains now? {proof.plan(proof.step)} Ctrl-C ends it at once, likewise."
+            )
             question += f" The gains are doubtful: {doubt}." if doubt else ""
             step = agreed_step(question, proof.step, proof.allowed)
             if not step:

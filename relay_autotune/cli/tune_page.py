@@ -22,7 +22,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from relay_autotune.analysis import options_from
-from relay_autotune.cli.after_tune import Proof, Tuned
+from relay_autotune.cli.after_tune import CONTROLLER, Proof, Tuned
 from relay_autotune.cli.apply_gains import found_entries, verified
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say, worst
 from relay_autotune.cli.loops import Loop
@@ -240,12 +240,14 @@ class _LoopOnPage:
         """Tune until the result is there."""
         client, live = self._client, self._live
         live.forget_wishes()
+        before = live.told
         self._cycles.clear()
         self._ultimate, self._ends, self._heeded = {}, [], len(self._interrupted)
         live.show("model", None)
         live.tell(
             phase="tuning", state="", status="asking for the tune", tone="", progress=0.0,
-            elapsed=0.0, cycles=(), process="", result=(), setpoint=math.nan, levels=(),
+            elapsed=0.0, cycles=(), process="", result=(), tuned=-1,
+            began=time.strftime("%H:%M"), setpoint=math.nan, levels=(),
             window=(live.now, 0.0), limits=tuple(self._options.within or ()),
         )  # fmt: skip
         with ExitStack() as stack:
@@ -260,7 +262,11 @@ class _LoopOnPage:
         for refused in sorted(client.refused):
             say(PROGRAM, refused)
         if not tune.is_started:
-            live.rest(f"refused: {result.reason}", good=False)
+            # What the page shows is still that of the tune before.
+            kept = {
+                n: getattr(before, n) for n in ("cycles", "process", "result", "tuned", "began")
+            }
+            live.rest(f"refused: {result.reason}", good=False, **kept)
             return NOTHING_FOUND
         lines = tune.lines(Paint())
         print("\n".join(lines), flush=True)
@@ -385,8 +391,17 @@ class _LoopOnPage:
             return replace(case_of(found, bag or self._loop.title), command=command(first))
 
         target = self._loop.target
-        subject = PageModel(shown(found), found.shaping, first, command, self._number, target)
+        subject = PageModel(
+            shown(found),
+            found.shaping,
+            first,
+            command,
+            self._number,
+            target,
+            self._live.told.began,
+        )
         self._page.add(subject)
+        self._live.tell(tuned=self._page.subjects.index(subject))
 
         def completed() -> None:
             every = shown(tune.analysed())
@@ -495,12 +510,12 @@ class GainsPage:
         if self.loop.proves and tune.has_gains:
             try:
                 self._tuned = tune
-                step = Proof(tune).step
+                proof = Proof(tune)
             except RelayAutotuneError as error:
                 say(PROGRAM, f"the gains cannot be proven: {error}")
                 self.live.tell(proves=False)
             else:
-                self.live.tell(proves=True, step=step, proof=())
+                self.live.tell(proves=True, step=proof.step, steps=proof.allowed.words, proof=())
 
     def do(self, wish: PageCommand) -> None:
         """Do what was wished with the gains in force.
@@ -509,6 +524,9 @@ class GainsPage:
         """
         live, controller = self.live, self._controller
         live.forget_wishes()
+        if wish.dry:
+            self._say_plan(wish)
+            return
         try:
             if wish.what == PROVE:
                 self._prove(wish)
@@ -527,16 +545,16 @@ class GainsPage:
     def _do(self, wish: PageCommand, controller: GainsClient) -> None:
         live = self.live
         if wish.what == REVERT:
-            live.tell(phase="applying", tone="", status="bringing back the gains before", proof=())
-            live.rest(controller.ask("revert"), good=True)
+            live.tell(phase="applying", tone="", status="bringing back the gains before")
+            live.rest(controller.ask("revert"), good=True, proof=())
             return
         with controller.accepting_doubtful() if wish.doubtful else nullcontext():
             if wish.what == APPLY:
-                live.tell(phase="applying", tone="", status="putting the gains in force", proof=())
+                live.tell(phase="applying", tone="", status="putting the gains in force")
                 message = self._message(wish)
                 if not wish.step:
                     told = controller.put_in_force(message)
-                    live.rest(f"{told}; they are not verified", good=True)
+                    live.rest(f"{told}; they are not verified", good=True, proof=())
                     return
                 controller.steps().allowed(gains_from_message(message)).require(wish.step)
                 with controller.offered(message) as gains:
@@ -549,32 +567,54 @@ class GainsPage:
     def _prove(self, wish: PageCommand) -> None:
         """Prove gains by a controller_node of the command, which ends after it."""
         live, message = self.live, self._message(wish)
-        self._begin_step("choosing the step")
-        if self._tuned is None:
-            raise TuningError("there are no gains of a tune that could be proven here")
-        proof = Proof(self._tuned, message)
+        proof = self._proof(message)
+        proof.allowed.require(wish.step)
+        self._begin_step(f"starting {CONTROLLER}")
         result = proof.made(
             wish.step, wish.doubtful, lambda text: live.tell(status=text), self.leave,
-            lambda steps: live.show("proof", [_document(step) for step in steps]),
+            self._show_steps,
         )  # fmt: skip
         left = f"the command stands at {self.loop.options.at:.6g} u"
         live.rest(
             f"proof {'passed' if result.passed else 'failed'}: {result.reason}; {left}",
             good=result.passed,
             proof=(
-                ("gains", _said(gains_from_message(message))),
+                ("gains", f"{_said(gains_from_message(message))}, at {time.strftime('%H:%M')}"),
                 *found_entries(result, proof.noise_std),
-            ),
+            )
+            if result.steps
+            else live.told.proof,
         )
+
+    def _proof(self, message: Any) -> Proof:
+        if self._tuned is None:
+            raise TuningError("there are no gains of a tune that could be proven here")
+        return Proof(self._tuned, message)
+
+    def _say_plan(self, wish: PageCommand) -> None:
+        """Say what a proof would do, or why it cannot be made; nothing moves."""
+        live, plan, refusal = self.live, "", ""
+        live.tell(phase="checking")
+        try:
+            proof = self._proof(self._message(wish))
+            live.tell(steps=proof.allowed.words)
+            plan = proof.plan(wish.step)
+        except RelayAutotuneError as error:
+            refusal = str(error)
+        live.tell(phase="idle", plan=plan, refusal=refusal, planned=live.told.planned + 1)
+
+    def _show_steps(self, steps: Sequence[Any]) -> None:
+        """Show a proof in place of the one before; one that was cut short has no steps."""
+        if steps:
+            self.live.show("proof", [_document(step) for step in steps])
 
     def _begin_step(self, status: str) -> None:
         """Show from now on the samples of a step in place of those of the tune."""
         live = self.live
         live.tell(
-            phase="verifying", tone="warn", status=status, proof=(), window=(live.now, 0.0),
+            phase="verifying", tone="warn", status=status, window=(live.now, 0.0),
             setpoint=math.nan, levels=(),
         )  # fmt: skip
-        live.show("proof", [])
 
     def _message(self, wish: PageCommand) -> Any:
         """Return the gains that the page shows as a message."""
@@ -599,11 +639,11 @@ class GainsPage:
         result, entries = verified(
             controller, wish.step, lambda text: live.tell(status=text), self.leave, new, noise
         )
-        live.show("proof", [_document(step) for step in controller.steps_of(result)])
+        self._show_steps(controller.steps_of(result))
         live.rest(
             f"verification {'passed' if result.passed else 'failed'}: {result.reason}",
             good=result.passed,
-            proof=tuple(entries),
+            proof=tuple(entries) if result.steps else live.told.proof,
         )
 
 

@@ -50,6 +50,8 @@ class PageCommand:
     """Whether gains whose verdict is not trusted are accepted."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Of the loop by name, with which a tune is to run: a number, or the two ends of a range."""
+    dry: bool = False
+    """Whether it is only to be said what a proof would do."""
 
     def __post_init__(self) -> None:
         check(self, TuningError)
@@ -85,10 +87,16 @@ class Told:
     :param checked: number of checks so far.
     :param accepted: whether a tune could start, as far as the last check knows.
     :param result: lines of the last result.
+    :param began: time of the day at which the last tune began.
+    :param tuned: number of the model that it has given; -1: none.
     :param controller: full name of the controller_node; empty: there is none.
     :param present: its gains, in words.
     :param proves: whether a controller_node of the command can prove gains.
     :param step: of its set-point that verifies gains as usual [y]; NaN: not known.
+    :param planned: number of proofs so far of which it was said what they would do.
+    :param plan: what the last of these would do; empty: it cannot be made.
+    :param refusal: why.
+    :param steps: the steps that may prove the gains, in words.
     :param proof: of the last verification: names and texts.
     """
 
@@ -112,10 +120,16 @@ class Told:
     checked: int = 0
     accepted: bool = False
     result: tuple[str, ...] = ()
+    began: str = ""
+    tuned: int = -1
     controller: str = ""
     present: str = ""
     proves: bool = False
     step: float = math.nan
+    planned: int = 0
+    plan: str = ""
+    refusal: str = ""
+    steps: str = ""
     proof: tuple[tuple[str, str], ...] = ()
 
 

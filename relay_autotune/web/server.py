@@ -446,6 +446,7 @@ class _Socket(_Guarded, WebSocketHandler):
             question.get("step", 0.0),
             question.get("accept_doubtful") is True,
             dict(question.get("settings", {})),
+            question.get("dry") is True,
         )
 
     def _tell_news(self) -> None:

@@ -177,6 +177,7 @@ class PageModel:
     :param command: returns the command line that gives the same again.
     :param loop: number of the loop that it is of, on a page that watches some.
     :param target: where gains go that are written to a file.
+    :param when: time of the day at which its tune began; empty: it is of no tune of this page.
     """
 
     case: Case
@@ -185,6 +186,7 @@ class PageModel:
     command: Callable[[DesignRequest], str]
     loop: int = 0
     target: Target = field(default_factory=Target)
+    when: str = ""
     _found: dict[DesignRequest, tuple[Designed, Gains] | TuningError] = field(
         default_factory=dict, repr=False
     )

@@ -82,6 +82,7 @@ def of_subject(subject: PageModel) -> dict[str, Any]:
     return {
         "name": visible(case.source),
         "loop": subject.loop,
+        "when": subject.when,
         "facts": [visible(fact) for fact in facts_of(case, with_id=True)] if case.samples else [],
         "verdict": _verdict(case),
         "checks": _checks(case),
@@ -227,7 +228,7 @@ def of_trade_off(subject: PageModel, asked: DesignRequest) -> list[list[Any]]:
 def _effects(shaped: DesignResult) -> list[list[str]]:
     gains = shaped.gains
     rows = [
-        ["Ms", digits(gains.ms, 3), "below 1.4 careful, above 2 risky"],
+        ["Ms of the model", digits(gains.ms, 3), "below 1.4 careful, above 2 risky"],
         ["Ms of 95 %", digits(gains.ms_95, 3), "of the models around stay below"],
         ["Mt", digits(gains.mt, 3), ""],
         ["gain margin", digits(gains.gain_margin, 3), "factor by which the gain may grow"],

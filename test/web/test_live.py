@@ -7,13 +7,16 @@ import asyncio
 import json
 import math
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from analysed import analysed_once
 from chromium import Chromium
 from served import HOSTILE, analysed, served, subject_of
 from tornado.websocket import websocket_connect
 
+from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import ultimate_of
 from relay_autotune.web import live as live_module
 from relay_autotune.web.live import Live, PageCommand
@@ -292,17 +295,92 @@ def test_on_a_phone_a_wish_shows_what_comes_of_it_and_a_model_stands_once(tmp_pa
         # the model is that of the experiment below
         assert tab.text("#process")
         assert not tab.eval("document.querySelector('#live-process').checkVisibility()")
+        # what it would do is asked first, and a step that cannot be made ends there
         tab.click("#prove")
+        assert tab.until(live.next_wish, "the wish").dry
+        live.tell(planned=1, refusal="the step is 9 y, expected from -3 to 4 y")
+        tab.wait(
+            "document.querySelector('#force-new').innerText.includes('expected from -3 to 4 y')"
+        )
+        assert not tab.eval("document.querySelector('#question').open")
+        tab.click("#prove")
+        assert tab.until(live.next_wish, "the wish").dry
+        live.tell(planned=2, refusal="", plan="The valve is expected from 46 to 58 u, for 2 min.")
         tab.wait("document.querySelector('#question').open")
+        assert "from 46 to 58 u, for 2 min" in tab.text("#question-text")
         tab.eval("scrollTo(0, document.body.scrollHeight)")
         tab.click("#question-yes")
-        tab.until(live.next_wish, "the wish")
+        assert not tab.until(live.next_wish, "the wish").dry
         assert tab.eval("scrollY") == 0
         # the figure of a proof does not stand beside the gains of the next tune
         live.tell(phase="tuning", proof=())
         tab.wait("document.querySelector('#proof').hidden")
         assert tab.eval("document.querySelector('#live-process').checkVisibility()")
         assert tab.said == []
+
+
+@pytest.mark.browser
+def test_a_tune_without_gains_leaves_the_earlier_ones_grey_with_their_time(tmp_path):
+    live = Live("/relay_node")
+    live.tell(tuned=0, began="09:12")
+    subject = subject_of(analysed())
+    subject.when = "09:12"
+    with served([subject], live=live) as url, Chromium(tmp_path) as browser:
+        tab = browser.tab()
+        tab.size(390, 844)
+        tab.go(url)
+        tab.wait("document.querySelector('#gains').innerText.startsWith('kc')")
+        colour = "getComputedStyle(document.querySelector('#gains')).color"
+        valid = tab.eval(colour)
+        assert tab.text("#gains-of") == "of the tune at 09:12"
+        # the gains are in reach on a phone: to prove and to keep them stands above the figures
+        tops = [
+            tab.eval(f"document.querySelector('{each}').getBoundingClientRect().top")
+            for each in ("#live-now", "#keep-box", "#steps", "#controller")
+        ]
+        assert tops == sorted(tops) and tops[1] < 844
+        live.tell(tuned=-1, began="09:31")
+        said = "of the tune at 09:12; the last tune, at 09:31, gave none"
+        tab.wait(f"document.querySelector('#gains-of').innerText === {said!r}")
+        assert tab.eval(colour) != valid
+        assert tab.said == []
+
+
+@pytest.mark.browser
+def test_a_tune_that_was_aborted_does_not_show_the_gains_of_the_one_before(tmp_path):
+    aborted = replace(analysed().record, outcome=Outcome.ABORTED, reason="a button")
+    subjects = [subject_of(analysed()), subject_of(analysed_once(aborted))]
+    with served(subjects) as url, Chromium(tmp_path) as browser:
+        tab = browser.tab(url)
+        tab.wait("document.querySelector('#gains').innerText.startsWith('kc')")
+        tab.click("#tabs button:nth-child(2)")
+        tab.wait("document.querySelector('#reason').checkVisibility()")
+        assert tab.text("#gains") == "no gains"
+
+
+@pytest.mark.browser
+def test_what_must_be_read_first_stands_first_and_a_finger_that_scrolls_moves_no_slider(tmp_path):
+    subject = subject_of(analysed())
+    note = "The process answers differently up and down."
+    model = replace(subject.case.model, warnings=(note,))
+    subject.case = replace(subject.case, model=model)
+    live = Live("/relay_node")
+    with served([subject], live=live) as url, Chromium(tmp_path) as browser:
+        tab = browser.tab()
+        tab.size(390, 844)
+        tab.go(url)
+        tab.wait("document.querySelector('#notes').checkVisibility()")
+        assert note in tab.text("#notes")
+        top = "document.querySelector('{}').getBoundingClientRect().top"
+        assert tab.eval(top.format("#notes")) < tab.eval(top.format("#live-now"))
+        tab.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=1)
+        tab.eval("document.querySelector('#noise-share').scrollIntoView({block: 'center'})")
+        before = tab.eval("document.querySelector('#noise-share').value")
+        y = tab.eval(top.format("#noise-share")) + 15
+        for k, kind in enumerate(["touchStart", *["touchMove"] * 8, "touchEnd"]):
+            points = [] if kind == "touchEnd" else [{"x": 250, "y": y - 25 * k}]
+            tab.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+        assert tab.eval("document.querySelector('#noise-share').value") == before
 
 
 def test_a_model_that_is_added_is_told_to_open_pages():

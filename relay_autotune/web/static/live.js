@@ -188,6 +188,7 @@ export class Live {
     $("verify").addEventListener("click", () => this.verify(Number($("step").value)));
     $("revert").addEventListener("click", () => this.revert());
     $("step").addEventListener("input", () => this.showForce());
+    this.planned = () => {}; // called with what is known once it is said what a proof would do
     document.addEventListener("visibilitychange", () => this.drawSoon());
   }
 
@@ -217,6 +218,7 @@ export class Live {
         if ($("plan").open) $("plan").close();
       }
       if (loop === this.loop) this.show(before);
+      if (before && before.planned < loop.told.planned) this.planned(loop.told);
     }
     if (loop !== this.loop) return;
     const { proof, model } = message.shown || {};
@@ -366,6 +368,7 @@ export class Live {
     const new_ = this.offered();
     $("force-now").textContent = controller ? `${controller} has ${present}` : "Nobody controls this loop: a controller of this command makes one step, and ends.";
     $("force-new").textContent = new_ ? `${controller ? "To apply" : "To prove"}: ${new_.words}${new_.doubtful ? ", which are doubtful" : ""}.` : "The page shows no gains that could be applied.";
+    $("steps-allowed").textContent = this.told.steps;
     const idle = phase === "idle";
     const step = Number($("step").value);
     const moves = Number.isFinite(step) && step !== 0;
@@ -439,8 +442,14 @@ export class Live {
     if (!new_) return;
     const { loop } = this;
     if (new_.doubtful && !(await this.agreed(`These gains are doubtful: ${new_.doubtful}`, "Take them all the same"))) return;
-    const what = `A controller of this command takes over ${this.told.node} with ${new_.words}, moves the set-point by ${step} y and back, and ends at the present command.`;
-    if (await this.agreed(what, "Prove the gains")) this.send("prove", { ...new_.wish, step, accept_doubtful: Boolean(new_.doubtful) }, loop);
+    const wish = { ...new_.wish, step, accept_doubtful: Boolean(new_.doubtful) };
+    const said = new Promise((resolve) => { this.planned = resolve; });
+    $("force-new").textContent = "computing what the step will do";
+    this.wish("prove", { loop: loop.number, ...wish, dry: true });
+    const { plan, refusal } = await said;
+    this.showForce();
+    if (refusal) $("force-new").textContent = `It cannot be made: ${refusal}`;
+    else if (await this.agreed(`Gains: ${new_.words}. ${plan}`, "Prove the gains")) this.send("prove", wish, loop);
   }
 
   // The settings of the form; null: one of them is missing.

@@ -200,15 +200,15 @@ function showShaped(s, sketched) {
   table($("effects"), s.effects, ["", "", "interval"]);
   if (!sketched) showBeside();
   $("why").textContent = `Rule ${s.rule}: ${s.reason}`;
-  $("notes").hidden = !s.warnings.length;
-  for (const id of ["warnings", "remarks"]) {
-    $(id).replaceChildren();
-    for (const text of s[id]) put($(id), "li", text);
-  }
+  const notes = [...s.warnings, ...s.remarks];
+  $("notes").hidden = !notes.length;
+  $("notes-title").textContent = s.warnings.length ? "Read this first" : "To be known";
+  $("warnings").replaceChildren();
+  for (const text of notes) put($("warnings"), "li", text);
   $("weight-value").textContent = s.b.toFixed(2);
   if (asked.setpoint_weight === null) $("weight").value = s.b;
   showSteps(s.steps);
-  const circle = { x: [], y: [], kind: "limit", name: `Ms ${s.ms.toFixed(2)}` };
+  const circle = { x: [], y: [], kind: "limit", name: `Ms of the model, ${s.ms.toFixed(2)}` };
   for (let k = 0; k <= 90; k += 1) {
     circle.x.push(-1 + Math.cos((k * Math.PI) / 45) / s.ms);
     circle.y.push(Math.sin((k * Math.PI) / 45) / s.ms);
@@ -276,20 +276,33 @@ function showSubject() {
   const here = subjects.map((each, k) => [each, k]).filter(([each]) => each.loop === subject.loop);
   $("tabs").hidden = here.length < 2;
   here.forEach(([each, k]) => {
-    const button = put($("tabs"), "button", each.name);
+    const button = put($("tabs"), "button", each.when ? `tune at ${each.when}` : each.name);
     button.type = "button";
     button.setAttribute("aria-pressed", String(k === chosen));
     button.addEventListener("click", () => choose(k));
   });
 }
 
+// Which tune the gains are of: after one without gains those before stay.
+function showOf() {
+  const { when } = subjects[chosen];
+  const none = Boolean(when) && live.told.tuned < 0;
+  document.body.classList.toggle("old", none);
+  const last = none && live.told.phase === "idle" ? `; the last tune, at ${live.told.began}, gave none` : "";
+  $("gains-of").textContent = when ? `of the tune at ${when}${last}` : "";
+}
+
 function choose(k) {
   chosen = k;
   shaped = null;
+  // Those of another model.
+  $("gains").textContent = subjects[k].may_shape ? "" : "no gains";
+  $("notes").hidden = true;
   trade = trades[k] || [];
   asked = remembered(subjects[k]);
   showSubject();
   showControls();
+  showOf();
   ask();
 }
 const trades = [];
@@ -354,7 +367,7 @@ function showLoop() {
   $("facts").replaceChildren();
   $("gains").textContent = $("verdict").textContent = "";
   $("notes").hidden = true;
-  $("marks").textContent = saidChecks = "";
+  $("marks").textContent = $("gains-of").textContent = saidChecks = "";
   live.showForce();
 }
 
@@ -364,6 +377,7 @@ function take(message) {
   if (message.live || message.samples || message.shown) {
     live ??= new Live((what, more) => socket.send(JSON.stringify({ do: what, ...more })), agreed, offered, showLoop);
     live.take(message);
+    if (chosen >= 0) showOf();
     return;
   }
   if (message.subjects) {
