@@ -72,3 +72,22 @@ def test_an_experiment_that_was_aborted_has_no_gains_to_send():
 def test_gains_that_are_not_there_are_not_sent(wish):
     with pytest.raises(TuningError, match="no such gains"):
         sent(subject_of(analysed()), wish)
+
+
+def test_a_proof_that_is_refused_leaves_the_one_that_has_passed():
+    subject, live = subject_of(analysed()), Live("/relay_node")
+    worker = SimpleNamespace(ask=lambda work: ThreadPoolExecutor(1).submit(work))
+    client = SimpleNamespace(wait=lambda is_done, patience: [None for _ in iter(is_done, True)])
+    loop = SimpleNamespace(client=client, proves=True)
+    page = SimpleNamespace(subjects=[subject], worker=worker)
+    passed = (("verdict", "passed"),)
+    live.tell(proof=passed, status="proof passed")
+    live.show("proof", [1])
+    gains = GainsPage(loop, live, page, 0, lambda: False)
+    # no tune has left a model on which the step could be predicted
+    gains.do(replace(CALM, what="prove", dry=True))
+    assert (live.told.plan, live.told.status) == ("", "proof passed")
+    assert "no gains of a tune" in live.told.refusal
+    gains.do(replace(CALM, what="prove"))
+    assert "no gains of a tune" in live.told.status
+    assert live.told.proof == passed and live.everything()["shown"] == {"proof": [1]}

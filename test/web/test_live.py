@@ -19,6 +19,7 @@ from tornado.websocket import websocket_connect
 from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import ultimate_of
 from relay_autotune.web import live as live_module
+from relay_autotune.web import wire
 from relay_autotune.web.live import Live, PageCommand
 from relay_autotune.web.wire import of_running
 
@@ -359,11 +360,12 @@ def test_a_tune_that_was_aborted_does_not_show_the_gains_of_the_one_before(tmp_p
 
 
 @pytest.mark.browser
-def test_what_must_be_read_first_stands_first_and_a_finger_that_scrolls_moves_no_slider(tmp_path):
-    subject = subject_of(analysed())
+def test_what_must_be_read_first_stands_first_and_a_finger_that_scrolls_moves_no_slider(
+    tmp_path, monkeypatch
+):
     note = "The process answers differently up and down."
-    model = replace(subject.case.model, warnings=(note,))
-    subject.case = replace(subject.case, model=model)
+    monkeypatch.setattr(wire, "remarks_of", lambda case: (note,))
+    subject = subject_of(analysed())
     live = Live("/relay_node")
     with served([subject], live=live) as url, Chromium(tmp_path) as browser:
         tab = browser.tab()
@@ -380,7 +382,7 @@ def test_what_must_be_read_first_stands_first_and_a_finger_that_scrolls_moves_no
         for k, kind in enumerate(["touchStart", *["touchMove"] * 8, "touchEnd"]):
             points = [] if kind == "touchEnd" else [{"x": 250, "y": y - 25 * k}]
             tab.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
-        assert tab.eval("document.querySelector('#noise-share').value") == before
+        tab.wait(f"document.querySelector('#noise-share').value === {before!r}", 10.0)
 
 
 def test_a_model_that_is_added_is_told_to_open_pages():

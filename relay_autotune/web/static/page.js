@@ -482,6 +482,15 @@ $("copy").addEventListener("click", async () => {
     $("kept").textContent = "The command is selected: copy it.";
   }
 });
+// A browser moves a slider at the first touch; where the finger then scrolls, it goes back.
+for (const slider of document.querySelectorAll("input[type=range]")) {
+  let before = slider.value;
+  slider.addEventListener("pointerdown", () => { before = slider.value; });
+  slider.addEventListener("pointercancel", () => {
+    slider.value = before;
+    slider.dispatchEvent(new Event("input"));
+  });
+}
 $("theme").addEventListener("click", () => {
   const root = document.documentElement;
   const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
