@@ -187,7 +187,8 @@ export class Live {
     $("apply-only").addEventListener("click", () => this.apply(0));
     $("verify").addEventListener("click", () => this.verify(Number($("step").value)));
     $("revert").addEventListener("click", () => this.revert());
-    $("step").addEventListener("input", () => this.showForce());
+    this.said = ""; // what the page waits for, or why the step cannot be made
+    $("step").addEventListener("input", () => { this.said = ""; this.showForce(); });
     this.planned = () => {}; // called with what is known once it is said what a proof would do
     document.addEventListener("visibilitychange", () => this.drawSoon());
   }
@@ -367,7 +368,7 @@ export class Live {
     const { controller, present, phase } = this.told;
     const new_ = this.offered();
     $("force-now").textContent = controller ? `${controller} has ${present}` : "Nobody controls this loop: a controller of this command makes one step, and ends.";
-    $("force-new").textContent = new_ ? `${controller ? "To apply" : "To prove"}: ${new_.words}${new_.doubtful ? ", which are doubtful" : ""}.` : "The page shows no gains that could be applied.";
+    $("force-new").textContent = this.said || (new_ ? `${controller ? "To apply" : "To prove"}: ${new_.words}${new_.doubtful ? ", which are doubtful" : ""}.` : "The page shows no gains that could be applied.");
     $("steps-allowed").textContent = this.told.steps;
     const idle = phase === "idle";
     const step = Number($("step").value);
@@ -444,12 +445,13 @@ export class Live {
     if (new_.doubtful && !(await this.agreed(`These gains are doubtful: ${new_.doubtful}`, "Take them all the same"))) return;
     const wish = { ...new_.wish, step, accept_doubtful: Boolean(new_.doubtful) };
     const said = new Promise((resolve) => { this.planned = resolve; });
-    $("force-new").textContent = "computing what the step will do";
+    this.said = "computing what the step will do";
+    this.showForce();
     this.wish("prove", { loop: loop.number, ...wish, dry: true });
     const { plan, refusal } = await said;
+    this.said = refusal && `It cannot be made: ${refusal}`;
     this.showForce();
-    if (refusal) $("force-new").textContent = `It cannot be made: ${refusal}`;
-    else if (await this.agreed(`Gains: ${new_.words}. ${plan}`, "Prove the gains")) this.send("prove", wish, loop);
+    if (!refusal && await this.agreed(`Gains: ${new_.words}. ${plan}`, "Prove the gains")) this.send("prove", wish, loop);
   }
 
   // The settings of the form; null: one of them is missing.
