@@ -296,6 +296,8 @@ def test_on_a_phone_a_wish_shows_what_comes_of_it_and_a_model_stands_once(tmp_pa
         # the model is that of the experiment below
         assert tab.text("#process")
         assert not tab.eval("document.querySelector('#live-process').checkVisibility()")
+        # nothing moves under the pointer any more
+        tab.wait("document.body.dataset.settled === 'yes'")
         # what it would do is asked first, and a step that cannot be made ends there
         tab.click("#prove")
         assert tab.until(live.next_wish, "the wish").dry
