@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,9 @@ def read_experiments(
     else:
         with opened(paths, wanted.clock, wanted.largest_chunk, progress) as topics:
             records, notes = _of_topics(topics, wanted)
-    parts = tuple(window(record, wanted.start, wanted.end) for record in records)
+    parts = tuple(records)
+    if wanted.is_part:
+        parts = tuple(p for r in records for p in window(r, wanted.start, wanted.end))
     # Those of relay_node may be of several loops, and tell of themselves how they ended.
     of_one = all(record.outcome is Outcome.UNKNOWN for record in records)
     return Recording(path, parts, tuple(notes), of_one)
@@ -455,16 +458,19 @@ def join(measurement: Signal, command: Signal, *, dated: bool = True) -> Record:
     return record
 
 
-def window(record: Record, start: float | None, end: float | None) -> Record:
+def window(record: Record, start: float | None, end: float | None) -> list[Record]:
     """Return the part of a record between two times; the command's history is kept.
+
+    It is apart where a gap in a table hides a change of the command. Pieces without a move, or of
+    few samples, are left out where others remain.
 
     :param record: the record.
     :param start: first time to keep [s from the first sample]; None: the beginning.
     :param end: last time to keep [s from the first sample]; None: the end.
     :raises SelectionError: if no sample lies between them.
     """
-    if start is None and end is None:
-        return record
+    from relay_autotune.record.excitation import gaps_of
+
     time = record.time - record.time[0]
     low = 0 if start is None else int(np.searchsorted(time, start, side="left"))
     high = time.size if end is None else int(np.searchsorted(time, end, side="right"))
@@ -473,7 +479,13 @@ def window(record: Record, start: float | None, end: float | None) -> Record:
             f"no sample lies between --start {0.0 if start is None else start:g} s and "
             f"--end {time[-1] if end is None else end:g} s; the recording is {time[-1]:g} s long"
         )
-    return record.part(low, high)
+    hidden = gaps_of(record).hidden if time.size > 1 else np.empty(0, dtype=np.int64)
+    ends = [low, *hidden[(hidden > low) & (hidden < high)].tolist(), high]
+    if len(ends) == 2:
+        return [record.part(low, high)]
+    pieces = [record.part(a, b) for a, b in pairwise(ends) if b - a >= _FEWEST_SAMPLES]
+    moving = [piece for piece in pieces if np.ptp(piece.command) > 0.0]
+    return moving or pieces[:1] or [record.part(*ends[:2])]
 
 
 def _check(signal: Signal, role: str) -> None:

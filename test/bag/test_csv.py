@@ -337,6 +337,21 @@ def test_empty_cells_are_a_gap_that_is_said(tmp_path):
     )
 
 
+def test_a_named_part_is_apart_at_a_gap_in_which_the_command_changed(tmp_path):
+    """The row after the gap comes late, and one model of all would get too little dead time."""
+    steps = [(k, float(k % 7), float(20 <= k < 40 or k >= 70)) for k in range(100)]
+    text = "t,y,u\n" + "".join(f"{t},{y},{u}\n" for t, y, u in steps if not 33 < t < 45)
+    path = write(tmp_path / "a.csv", text)
+    found = read_experiments(path, Selection(start=0.0))
+    assert [len(record) for record in found.experiments] == [34, 55]
+    assert "an experiment ends there" in found.notes[0]
+    # Without a move that is known nothing is left to learn from.
+    (before,) = read_experiments(path, Selection(start=0.0, end=60.0)).experiments
+    assert len(before) == 34
+    (still,) = read_experiments(path, Selection(start=21.0, end=60.0)).experiments
+    assert np.ptp(still.command) == 0.0
+
+
 def test_of_two_rows_at_one_time_the_second_has_the_step(tmp_path):
     text = "t,y,u\n0,1,0\n0,1,5\n" + "".join(f"{k},{k},5\n" for k in range(1, 20))
     found = read_experiments(write(tmp_path / "a.csv", text))
