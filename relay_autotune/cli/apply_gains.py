@@ -321,14 +321,19 @@ def found_entries(result: Any, noise_std: float = math.nan) -> list[tuple[str, s
     for step in result.steps:
         setpoint = step.kind == step.SETPOINT
         moved = NOISE_ALLOWANCE * noise_std / abs(step.step) if setpoint else 0.0
-        unsure = f" +- {100.0 * moved:.0f}" if moved > _SEEN else ""
+        unsure, within, predicted = "", f"{100.0 * SETTLED:.0f} %", "predicted"
+        if moved > _SEEN:
+            unsure = f" +- {100.0 * moved:.0f}"
+            # Noise leaves no narrower band, and the prediction has none.
+            within, predicted = f"{100.0 * (SETTLED + moved):.0f} %", f"predicted within {within}:"
         name = "set-point step" if setpoint else "load step"
         text = (
             f"{step.step:+g} {'y' if setpoint else 'u'}: overshoot "
             f"{100.0 * step.overshoot:.0f}{unsure} % "
             f"(predicted {100.0 * step.overshoot_predicted:.0f} %), settled within "
-            f"{100.0 * SETTLED:.0f} % after "
-            f"{duration(step.settling_time)} (predicted {duration(step.settling_time_predicted)})"
+            f"{within} after "
+            f"{duration(step.settling_time)} "
+            f"({predicted} {duration(step.settling_time_predicted)})"
         )
         found.append((name, text))
     if result.steps:
