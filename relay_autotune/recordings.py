@@ -198,7 +198,7 @@ def _taken_apart(record: Record, *, whole: bool) -> tuple[list[Record], list[str
     """
     from relay_autotune.record.excitation import find_experiments
 
-    missing = _missing_rows(record) if len(record) > 1 else []
+    missing = _missing_rows(record)
     if whole or len(record) < _FEWEST_SAMPLES:
         return [record], missing
     stretches = find_experiments(record)
@@ -479,13 +479,11 @@ def window(record: Record, start: float | None, end: float | None) -> list[Recor
             f"no sample lies between --start {0.0 if start is None else start:g} s and "
             f"--end {time[-1] if end is None else end:g} s; the recording is {time[-1]:g} s long"
         )
-    hidden = gaps_of(record).hidden if time.size > 1 else np.empty(0, dtype=np.int64)
+    hidden = gaps_of(record).hidden
     ends = [low, *hidden[(hidden > low) & (hidden < high)].tolist(), high]
-    if len(ends) == 2:
-        return [record.part(low, high)]
-    pieces = [record.part(a, b) for a, b in pairwise(ends) if b - a >= _FEWEST_SAMPLES]
-    moving = [piece for piece in pieces if np.ptp(piece.command) > 0.0]
-    return moving or pieces[:1] or [record.part(*ends[:2])]
+    pieces = [record.part(a, b) for a, b in pairwise(ends)]
+    long = [piece for piece in pieces if len(piece) >= _FEWEST_SAMPLES] or pieces[:1]
+    return [piece for piece in long if np.ptp(piece.command) > 0.0] or long[:1]
 
 
 def _check(signal: Signal, role: str) -> None:

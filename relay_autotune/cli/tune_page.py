@@ -263,10 +263,11 @@ class _LoopOnPage:
             say(PROGRAM, refused)
         if not tune.is_started:
             # What the page shows is still that of the tune before.
-            kept = {
-                n: getattr(before, n) for n in ("cycles", "process", "result", "tuned", "began")
-            }
-            live.rest(f"refused: {result.reason}", good=False, **kept)
+            live.rest(
+                f"refused: {result.reason}", good=False, cycles=before.cycles,
+                process=before.process, result=before.result, tuned=before.tuned,
+                began=before.began,
+            )  # fmt: skip
             return NOTHING_FOUND
         lines = tune.lines(Paint())
         print("\n".join(lines), flush=True)
@@ -400,8 +401,7 @@ class _LoopOnPage:
             target,
             self._live.told.began,
         )
-        self._page.add(subject)
-        self._live.tell(tuned=self._page.subjects.index(subject))
+        self._live.tell(tuned=self._page.add(subject))
 
         def completed() -> None:
             every = shown(tune.analysed())

@@ -424,21 +424,24 @@ class RelayExperiment:
         step = self.parameters.command_rate * (samples.time[-1] - samples.time[-2])
         return min(max(wanted, before - step), before + step)
 
+    @property
+    def _moved_by(self) -> dict[str, Value]:
+        """What has moved the process, for the reason at a limit."""
+        if self.state is State.SETTLING:
+            return {"baseline": self.baseline}
+        return {"amplitude": self._levels.amplitude}
+
     # The watches of every state.
 
     def _passes_limit(self, t: float, y: float) -> Ended | None:
         """Return the end of the experiment if the last sample passes a limit."""
         p = self.parameters
         low, high = p.measurement_min, p.measurement_max
-        # What has moved the process.
-        by: dict[str, Value] = {"baseline": self.baseline}
-        if self.state is not State.SETTLING:
-            by = {"amplitude": self._levels.amplitude}
         if not low <= y <= high:
-            why = Code.OUTSIDE_LIMITS(value=y, time=t, low=low, high=high, **by)
+            why = Code.OUTSIDE_LIMITS(value=y, time=t, low=low, high=high, **self._moved_by)
             return Ended(State.ABORTED, why)
         if p.max_deviation > 0.0 and (away := abs(y - self.facts.setpoint)) > p.max_deviation:
-            why = Code.TOO_FAR(value=y, time=t, away=away, most=p.max_deviation, **by)
+            why = Code.TOO_FAR(value=y, time=t, away=away, most=p.max_deviation, **self._moved_by)
             return Ended(State.ABORTED, why)
         if 0.0 < p.max_duration < t:
             return failed(Code.MAX_DURATION(limit=p.max_duration, where=self._phase.where))

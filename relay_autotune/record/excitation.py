@@ -107,8 +107,10 @@ class Gaps:
 def gaps_of(record: Record) -> Gaps:
     """Return the gaps in a table whose rows were written at a fixed interval.
 
-    :param record: a record of any origin, of two samples or more.
+    :param record: a record of any origin.
     """
+    if len(record) < 2:
+        return Gaps(np.empty(0, dtype=np.int64), 0.0, np.empty(0, dtype=np.int64))
     interval = np.diff(record.time)
     usual = float(np.median(interval))
     long = interval > GAP_INTERVALS * usual

@@ -101,10 +101,11 @@ class Page:
         for subject in subjects:
             self.add(subject)
 
-    def add(self, subject: PageModel) -> None:
+    def add(self, subject: PageModel) -> int:
         """Show another model; what the page shows of it first is computed at once.
 
         :param subject: the model.
+        :return: its number on the page.
         """
         with self._adding:
             self.subjects.append(subject)
@@ -112,6 +113,7 @@ class Page:
         self.changed()
         if subject.shaping is not None:
             self.worker.ask(partial(self._answer, number, subject.first))
+        return number
 
     def changed(self) -> None:
         """Tell all pages what is shown of the models."""
