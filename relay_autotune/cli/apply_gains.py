@@ -4,11 +4,11 @@
 """apply_gains: show new gains beside those in force, apply them, and verify them with a step.
 
 The gains are those of the last tune, and go to the loop's controller_node; with --file they are
-written instead, for ros2_controllers' pid_controller or the law that they are for. Nothing is
-changed before you answer yes, or give --yes. The height of the step is --step, else verify_step
-of the node, else half of the swing that the tune made and at least twenty times the noise (forty
-if that is within a third of the way to a limit), as far as the limits of the node allow. If the
-step fails, or its proof is cut short in any way, the node takes the gains before back by itself.
+written instead, for controller_node or the law that they are for. Nothing is changed before you
+answer yes, or give --yes. The height of the step is --step, else verify_step of the node, else
+half of the swing that the tune made and at least twenty times the noise (forty if that is within
+a third of the way to a limit), as far as the limits of the node allow. If the step fails, or its
+proof is cut short in any way, the node takes the gains before back by itself.
 
 Exit status: 0 the gains are in force and verified (with --file: written); 1 they are not; 2 the
 command line is wrong.
@@ -94,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--revert", action="store_true", help="take the gains before back")
     parser.add_argument(
         "--file", metavar="FILE",
-        help="write the gains, for pid_controller or the law that they are for; apply nothing",
+        help="write the gains, for controller_node or the law that they are for; apply nothing",
     )  # fmt: skip
     parser.add_argument(
         "--wait", type=finite, default=REST_WITHIN, metavar="S",
@@ -145,12 +145,12 @@ def apply_at(
 
 
 def _write(client: GainsClient, options: argparse.Namespace) -> int:
-    from relay_autotune.exchange.export import WITHOUT_LAW, Target, exported
-    from relay_autotune.loop.laws import LAWS
+    from relay_autotune.exchange.export import Target, exported
+    from relay_autotune.loop.laws import LAWS, OWN_LAW
 
     gains, doubt = client.waiting()
     _require_trust(doubt, options)
-    how = gains.law or WITHOUT_LAW
+    how = gains.law or OWN_LAW
     write(exported(gains, how, Target(), doubt=doubt), options.file)
     load = f"; load it with ros2 param load /pid_controller {options.file}"
     print(f"written for {how}: {options.file}{load if LAWS[how].sets_gains else ''}")

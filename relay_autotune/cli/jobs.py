@@ -36,7 +36,7 @@ from relay_autotune.cli.arguments import (
 from relay_autotune.cli.table import compared_lines, rows, table
 from relay_autotune.cli.terminal import WIDEST, Working
 from relay_autotune.errors import NotThereError, RelayAutotuneError, SelectionError, defect
-from relay_autotune.exchange.export import EXPORTS, WITHOUT_LAW, Target, exported
+from relay_autotune.exchange.export import EXPORTS, Target, exported
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.loop.gains import FORMS, Controller, Gains
@@ -304,7 +304,7 @@ def design_options(options: argparse.Namespace) -> DesignOptions:
             f"--export {export!r} is no program that is known; expected one of "
             f"{', '.join(EXPORTS)}"
         )
-    if "law" not in given and export in LAWS and export != WITHOUT_LAW:
+    if "law" not in given and export in LAWS:
         given["law"] = export
     return DesignOptions(**given)
 

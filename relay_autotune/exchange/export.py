@@ -24,8 +24,6 @@ from relay_autotune.quantities import result_fields
 from relay_autotune.text import in_units
 
 _DIGITS = 10
-# Gains that are for no law in particular can be exported for this one.
-WITHOUT_LAW = "pid_controller"
 LAUNCH = "launch"
 _FILES = {"yaml": "gains.yaml", LAUNCH: "gains.launch.py"}
 EXPORTS = (*LAWS, "yaml", LAUNCH)
@@ -101,7 +99,7 @@ def _file(gains: Gains, how: str, target: Target) -> str:
         return plain(gains)
     if how == LAUNCH and gains.law in ("", OWN_LAW):
         return launch_file(gains, target)
-    if how not in ((gains.law,) if gains.law else (WITHOUT_LAW, OWN_LAW)):
+    if how != (gains.law or OWN_LAW):
         runs = gains.law or "controller_node, as a continuous controller"
         raise SelectionError(f"the gains are for {runs}: give --law {how} to export them for it")
     if how == OWN_LAW:
@@ -118,7 +116,7 @@ def exports_of(law: str) -> tuple[str, ...]:
     """
     if law not in ("", OWN_LAW):
         return law, "yaml"
-    return (OWN_LAW, *[WITHOUT_LAW] * (not law), "yaml", LAUNCH)
+    return OWN_LAW, "yaml", LAUNCH
 
 
 def file_name(how: str) -> str:
@@ -142,9 +140,8 @@ def parameters(gains: Gains, law: ProgramLaw, target: Target) -> str:
     clamps = (("u_clamp_max", target.command_max), ("u_clamp_min", target.command_min))
     stays = ("antiwindup_strategy",) if target.is_set_up else ()
     values = [each for each in _values(gains, law) if each[0] not in stays]
-    told = (*_lacking(gains), *_signed(gains))
     lines = [
-        *_comments(gains, told, "#", known=target.is_set_up),
+        *_comments(gains, _signed(gains), "#", known=target.is_set_up),
         f"# ros2 param load {target.node} FILE",
         f"{_key(target.node)}:",
         "  ros__parameters:",
@@ -386,22 +383,6 @@ def _comments(gains: Gains, more: Sequence[str], remark: str, *, known: bool = F
             told[-1] += " If it runs at another period, export again with --sample-period."
     told += gains.warnings
     return [f"{remark} {line}" for line in (*told, *more)]
-
-
-def _lacking(gains: Gains) -> list[str]:
-    """Return sentences on what pid_controller lacks for these gains."""
-    found = []
-    if gains.tf > 0.0:
-        found.append(
-            f"The controller has no filter on the measurement: filter it by tf = {gains.tf:.6g} s "
-            "before, or the derivative will pass all noise."
-        )
-    if gains.b != 1.0:
-        found.append(
-            f"The controller has no set-point weight: b = {gains.b:g} was asked for; a step of "
-            "the set-point will overshoot more than predicted, so ramp it."
-        )
-    return found
 
 
 def _signed(gains: Gains) -> list[str]:

@@ -111,12 +111,15 @@ def test_gains_without_integral_action_have_nothing_to_wind_up():
     assert "gains.joint.tracking_time_constant" not in found
 
 
-def test_what_pid_controller_lacks_is_said_in_the_file():
-    text = pid_controller(gains(-2.0, 4.0, 1.0, 0.1, b=0.0), Target())
-    assert "no filter on the measurement: filter it by tf = 0.1 s" in text
-    assert "no set-point weight: b = 0" in text
+def test_negative_gains_are_said_in_the_file():
+    text = pid_controller(gains(-2.0, 4.0, 1.0), Target())
     assert "All gains are negative" in text
     assert as_loaded(text)["gains.joint.tracking_time_constant"] == pytest.approx(2.0)
+
+
+def test_gains_for_no_program_are_not_written_for_one_that_lacks_their_filter():
+    with pytest.raises(SelectionError, match="give --law pid_controller"):
+        exported(gains(2.0, 4.0, 1.0, 0.1, b=0.0), "pid_controller", Target())
 
 
 @pytest.mark.parametrize("law", [name for name, law in LAWS.items() if law.sets_gains])
@@ -190,6 +193,10 @@ def test_replay_exports_the_gains_of_a_recording(capsys):
     found = as_loaded(capsys.readouterr().out)
     # 1.65 e^(-10 s)/(20 s + 1) with half a second more, and half of the recording's 0.2 s.
     assert found["gains.oven.p"] == pytest.approx(25.3 / (1.65 * 1.7 * 10.6), rel=1e-6)
+    # The program has neither a filter nor a set-point weight, which those of robust have.
+    assert replay.main(["--export", "pid_controller", "--pid", "bags/step_test"]) == 0
+    text = capsys.readouterr().out
+    assert "tf 0 s, b 1." in text and "Designed for pid_controller every 0.0985 s." in text
     for more in (["bags/step_test"], ["--json"]):
         assert replay.main([*asked, bag, *more]) == 2
         assert "one bag alone" in capsys.readouterr().err

@@ -842,7 +842,7 @@ def test_gains_that_failed_are_not_recommended_and_their_file_says_so(
     # It is what a controller_node of this loop starts with.
     words = with_gains_file(["--gains", "passed.yaml"])
     assert words[-1] == "controller_command:=/tank/valve"
-    shown(True, "", "pid_controller", "other.yaml")
+    shown(True, "", "pid_controller", "0.1", "other.yaml")
     assert "u_clamp_max: 100.0" in (tmp_path / "other.yaml").read_text()
 
 

@@ -230,9 +230,14 @@ def test_of_all_rules_one_without_the_form_is_told_as_such(capsys, tmp_path):
 
 def test_exports(capsys, tmp_path):
     asked = "--rule imc --export"
-    _, out, _ = run(capsys, FOPDT, asked, "pid_controller --dof heater --command-max 100")
+    to_heater = "pid_controller --dof heater --command-max 100"
+    status, out, err = run(capsys, FOPDT, asked, to_heater)
+    assert (status, out) == (1, "") and "give sample_period" in err
+    _, out, _ = run(capsys, FOPDT, asked, to_heater, "--sample-period 0.5")
     (section,) = yaml.safe_load(out).values()
-    assert section["ros__parameters"]["gains"]["heater"]["p"] == pytest.approx(0.8912655971)
+    # The rule's formula with a dead time of 10 s and half a period.
+    p = section["ros__parameters"]["gains"]["heater"]["p"]
+    assert p == pytest.approx(25.125 / (1.65 * 1.7 * 10.25))
     _, out, _ = run(capsys, FOPDT, asked, "yaml")
     assert yaml.safe_load(out)["ti"] == 25.0
     path = str(tmp_path / "gains.yaml")
@@ -271,7 +276,7 @@ REFUSED = [
     (FOPDT + " --phase-peak -30", 2, "between -180 and -90"),
     (FOPDT + " --output there", 2, "--output is for --export"),
     (FOPDT + " --table --export yaml", 2, "leave out --table"),
-    (FOPDT + " --export pid_controller --dof 2nd/", 2, "'2nd/' is not a name"),
+    (FOPDT + " --sample-period 1 --export pid_controller --dof 2nd/", 2, "'2nd/' is not a name"),
     (FOPDT + " there.json", 2, "given twice"),
     ("there.json", 2, "there.json cannot be read: No such file"),
     (FOPDT + " --rule lcmax", 1, "3 or more equal lags, found fopdt"),

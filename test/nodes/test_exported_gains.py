@@ -19,7 +19,16 @@ from ros_domain import free_domain
 from relay_autotune.cli.tune import main
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS
 
-MODEL = ("--gain", "1.65e5", "--time-constants", "20", "--dead-time", "10")
+MODEL = (
+    "--gain",
+    "1.65e5",
+    "--time-constants",
+    "20",
+    "--dead-time",
+    "10",
+    "--sample-period",
+    "0.5",
+)
 DOUBLES = ("p", "i", "d", "u_clamp_max", "u_clamp_min", "tracking_time_constant")
 
 
@@ -66,14 +75,14 @@ def test_as_a_node_reads_it_at_its_start(exported: Path) -> None:
             value = node.get_parameter(f"gains.heater.{name}").value
             assert isinstance(value, float), name
         assert node.get_parameter("gains.heater.i").value == pytest.approx(
-            node.get_parameter("gains.heater.p").value / 25.0
+            node.get_parameter("gains.heater.p").value / 25.125
         )
 
 
 def test_controller_node_starts_with_what_is_exported_for_it(tmp_path: Path) -> None:
     path = tmp_path / "gains.yaml"
     asked = ("--rule", "imc", "--export", "controller_node", "--command-max", "1e-5")
-    assert main([*MODEL, "--sample-period", "0.5", *asked, "--output", str(path)]) == 0
+    assert main([*MODEL, *asked, "--output", str(path)]) == 0
     with started_with(path, "any_name") as node:
         found = {n: p.value for n, p in node.get_parameters_by_prefix("").items()}
     declared = {entry.name: entry for entry in CONTROLLER_PARAMETERS}
