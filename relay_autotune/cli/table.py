@@ -194,7 +194,7 @@ def beside(
     rows = [(name, old, new, unit) for (name, old, unit, _), (_, new, _, _) in both]
     lines = in_columns([("", "present", "new", ""), *rows], width)
     if present is not None:
-        lines += labelled("compared", difference(now, gains), width)
+        lines += labelled("compared", difference(present, now, gains, model), width)
     return lines
 
 

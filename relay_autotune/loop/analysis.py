@@ -49,6 +49,7 @@ from relay_autotune.loop.stability import (
 )
 from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.text import digits
 
 _POINTS = 4096
 _MOST_POINTS = 1 << 18
@@ -431,25 +432,46 @@ def performance_beside(
 _ERROR, _MS = 1.05, 1.02
 
 
-def difference(present: Performance | None, new: Performance) -> str:
+def lasting_error(gains: Controller, model: TransferFunction) -> float:
+    """Return what a unit step of the load leaves of error, ``1/(1/K + kc)`` without integral.
+
+    :param gains: the gains.
+    :param model: the process; K is its gain, infinite if it integrates.
+    :return: without its sign [y/u].
+    """
+    if gains.i:
+        return 0.0
+    return abs(1.0 / (gains.kc + (0.0 if model.integrators else 1.0 / model.gain)))
+
+
+def difference(
+    present: Controller, does: Performance | None, new: Gains, model: TransferFunction
+) -> str:
     """Return in words what new gains change.
 
-    :param present: what the present gains do on the model; None: they make the loop unstable.
-    :param new: what the new gains do there.
+    :param present: the present gains.
+    :param does: what they do on the model; None: they make the loop unstable.
+    :param new: the new gains.
+    :param model: the process.
     """
-    if present is None:
+    if does is None:
         return "the present gains make the loop unstable on the model"
-    error = new.iae_load / present.iae_load if present.iae_load else math.inf
-    calm = -1 if new.ms > _MS * present.ms else int(present.ms > _MS * new.ms)
-    quick = -1 if error > _ERROR else int(error * _ERROR < 1.0)
-    words = (
-        ("less calm", "as calm", "calmer")[calm + 1],
-        "but" if calm * quick < 0 else "and",
-        ("slower", "as fast", "faster")[quick + 1],
-    )
-    told = (
-        f"the new gains are {' '.join(words)}: Ms {new.ms:.3g} instead of {present.ms:.3g}, "
-        f"{error:.2f} times the error after a step of the load"
-    )
+    before, after = lasting_error(present, model), lasting_error(new, model)
+    lasts = max(before, after) > 0.0
+    if lasts:
+        # An error that stays has no integral.
+        kinds = ("less exact", "as exact", "more exact")
+        told = f"a lasting error of {digits(after, 3)} instead of {digits(before, 3)} y/u"
+    else:
+        before, after = does.iae_load, new.iae_load
+        kinds = ("slower", "as fast", "faster")
+        told = f"{after / before:.2f} times the error"
+    calm = -1 if new.ms > _MS * does.ms else int(does.ms > _MS * new.ms)
+    good = -1 if after > _ERROR * before else int(after * _ERROR < before)
+    joined = "but" if calm * good < 0 else "and"
     more = "; where the present loop is calm enough, ask for faster ones with a larger ms"
-    return told + more * (quick < 0 < calm)
+    return (
+        f"the new gains are {('less calm', 'as calm', 'calmer')[calm + 1]} {joined} "
+        f"{kinds[good + 1]}: Ms {new.ms:.3g} instead of {does.ms:.3g}, {told} after a step of the "
+        f"load{more * (good < 0 < calm and not lasts)}"
+    )

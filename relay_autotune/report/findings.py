@@ -174,9 +174,10 @@ def change_of(case: Case) -> str:
 
     :param case: the experiment.
     """
-    if case.best_gains is None or case.present is None:
+    new, present, found = case.best_gains, case.present, case.model
+    if new is None or present is None or found is None:
         return ""
-    return difference(performance_of(case.present, case), case.best_gains)
+    return difference(present, performance_of(present, case), new, found.model)
 
 
 def performance_of(present: Controller, case: Case) -> Performance | None:

@@ -19,7 +19,7 @@ from report_cases import aborted, fruitless, only
 from relay_autotune.exchange.models import document, model_fields, to_json
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Combination, Rival, identified
-from relay_autotune.loop.analysis import analyse_loop, difference
+from relay_autotune.loop.analysis import Loop, analyse_loop, difference
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.structures import (
     FOPDT,
@@ -53,6 +53,7 @@ from relay_autotune.report.findings import (
 )
 from relay_autotune.report.page import page
 from relay_autotune.report.style import COLOURS
+from relay_autotune.tuning import tune
 from relay_autotune.verdict import Verdict
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
@@ -393,10 +394,25 @@ def test_what_new_gains_change_is_said_in_words() -> None:
         (1.0, 1.0, "as calm and as fast"),
     ):
         present = replace(new, ms=ms * new.ms, iae_load=iae * new.iae_load)
-        told = difference(present, new)
+        told = difference(present, present, new, MODEL)
         assert told.startswith(f"the new gains are {words}: Ms {new.ms:.3g} instead of ")
         assert f", {1.0 / iae:.2f} times the error" in told
         assert ("ask for faster ones" in told) == (words == "calmer but slower")
+
+
+@pytest.mark.parametrize("model", [MODEL, TransferFunction(0.2, (), (), 1, 1.0)], ids=str)
+def test_an_error_that_stays_is_not_compared_with_one_that_vanishes(model) -> None:
+    kc, duration = 0.3, 2000.0
+    alone, new = Controller(kc, 0.0), tune(model, "simc")
+    (_, load) = Loop(alone, model).step_responses(duration)
+    left = f"{load.measurement[-100]:#.3g}"
+    told = difference(alone, analyse_loop(alone, model), new, model)
+    assert f"more exact: Ms {new.ms:.3g} instead of " in told
+    assert f"a lasting error of 0 instead of {left} y/u after a step of the load" in told
+    back = difference(new, new, replace(new, kc=kc, ti=0.0), model)
+    assert (
+        f"less exact: Ms {new.ms:.3g} instead of {new.ms:.3g}, a lasting error of {left} " in back
+    )
 
 
 def test_it_says_how_to_repeat_the_report_and_the_test(monkeypatch) -> None:
