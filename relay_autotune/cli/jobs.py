@@ -46,7 +46,7 @@ from relay_autotune.record.excitation import resting_command
 from relay_autotune.record.record import Record
 from relay_autotune.recordings import read_experiments
 from relay_autotune.result import Analysis
-from relay_autotune.text import visible
+from relay_autotune.text import in_units, visible
 from relay_autotune.tuning.task import CONTROLLERS, DesignOptions
 from relay_autotune.verdict import Verdict
 
@@ -132,8 +132,8 @@ def replay(job: Job, working: Working | None = None) -> Done:
     try:
         analyses = analysed(job, said, working)
         if job.export is not None:
-            gains, text = _exported(analyses, *job.export, accept_doubtful=job.accept_doubtful)
-            said += [f"{job.name}: {warning}" for warning in gains.warnings]
+            gains, to, text = _exported(analyses, *job.export, doubtful=job.accept_doubtful)
+            said += [f"{job.name}: {in_units(each, to.units)}" for each in gains.warnings]
             for each in analyses:
                 if lines := compared_lines(each, job.present, job.table_width or WIDEST):
                     said.append("\n".join([f"{job.name}:", *lines]))
@@ -205,9 +205,9 @@ def analysed(job: Job, said: list[str], working: Working | None = None) -> tuple
 
 
 def _exported(
-    analyses: Sequence[Analysis], how: str, target: Target, *, accept_doubtful: bool
-) -> tuple[Gains, str]:
-    """Return gains, and them as a file; there must be those of one experiment alone."""
+    analyses: Sequence[Analysis], how: str, target: Target, *, doubtful: bool
+) -> tuple[Gains, Target, str]:
+    """Return gains, where they go, and the file; there must be those of one experiment alone."""
     found = [a for a in analyses if a.best_gains is not None]
     if not found:
         why = analyses[0].reason if analyses else "there is no experiment"
@@ -218,18 +218,20 @@ def _exported(
             "--start and --end, or take all for tests of one process by --jointly"
         )
     only = found[0]
-    if only.verdict is not Verdict.TRUSTED and not accept_doubtful:
+    if only.verdict is not Verdict.TRUSTED and not doubtful:
         raise RelayAutotuneError(
             f"gains are {only.verdict.name.lower()}: {only.judgement.reason}; give "
             "--accept-doubtful to export them anyway"
         )
     assert only.best_gains is not None
-    gains, to = only.best_gains, _from_rest(target, only.record)
-    return gains, exported(gains, how, to, doubt=only.judgement.reason).rstrip("\n")
+    gains, to = only.best_gains, _from_rest(target, only.record, only.shaping)
+    return gains, to, exported(gains, how, to, doubt=only.judgement.reason).rstrip("\n")
 
 
-def _from_rest(target: Target, record: Record | None) -> Target:
-    """Return where gains go with units, and the command at which a record rests, if it does."""
+def _from_rest(target: Target, record: Record | None, shaping: Shaping | None) -> Target:
+    """Return where gains go with units, noise, and the command at which a record rests."""
+    if shaping is not None:
+        target = replace(target, noise_std=shaping.task.options.noise_std)
     if record is None:
         return target
     reach = float(np.abs(record.command).max())
@@ -339,8 +341,8 @@ def export_target(options: argparse.Namespace) -> Target:
     :param options: with those of :func:`add_export`.
     :raises SelectionError: if a name or a clamp cannot be.
     """
-    limits = {n: getattr(options, n) for n in ("command_min", "command_max")}
-    given = {n: v for n, v in limits.items() if v is not None}
+    known = {n: getattr(options, n) for n in ("command_min", "command_max", "noise_std")}
+    given = {n: v for n, v in known.items() if v is not None}
     dof = options.dof or next(iter(getattr(options, "joint", ())), "joint")
     return Target(node=options.node, dof=dof, **given)
 
@@ -544,7 +546,9 @@ def show(
                 program, parser, options, web=None, web_address=None, export=None, **changed
             )
 
-        return PageModel(case, shaping, first, command, target=_from_rest(target, case.record))
+        return PageModel(
+            case, shaping, first, command, target=_from_rest(target, case.record, shaping)
+        )
 
     subjects = [subject(case, shaping) for case, shaping in models]
 

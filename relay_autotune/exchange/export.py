@@ -21,7 +21,7 @@ from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.loop.gains import Gains
 from relay_autotune.loop.laws import LAWS, OWN_LAW, ProgramLaw
 from relay_autotune.quantities import result_fields
-from relay_autotune.text import in_units
+from relay_autotune.text import digits, in_units, percent
 
 _DIGITS = 10
 LAUNCH = "launch"
@@ -43,6 +43,7 @@ class Target:
     :param command_max: upper clamp of the command [u]; inf: none.
     :param present: the command at which the process rests [u]; NaN: not known.
     :param reach: the largest command of the record, without its sign [u]; NaN: not known.
+    :param noise_std: standard deviation of the measurement's noise [y]; NaN: not known.
     :param parameters: of a controller_node by name, besides gains and limits of the command.
     :param topics: names of the topics of a controller_node, by their names without a remapping.
     :param units: of the measurement, by "y", and of the command, by "u", as far as known.
@@ -58,6 +59,7 @@ class Target:
     command_max: float = math.inf
     present: float = math.nan
     reach: float = math.nan
+    noise_std: float = math.nan
     parameters: Mapping[str, Any] = field(default_factory=dict)
     topics: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
@@ -96,7 +98,7 @@ def exported(gains: Gains, how: str, target: Target, *, doubt: str = "") -> str:
 
 def _file(gains: Gains, how: str, target: Target) -> str:
     if how == "yaml":
-        return plain(gains)
+        return plain(gains, target)
     if how == LAUNCH and gains.law in ("", OWN_LAW):
         return launch_file(gains, target)
     if how != (gains.law or OWN_LAW):
@@ -141,7 +143,7 @@ def parameters(gains: Gains, law: ProgramLaw, target: Target) -> str:
     stays = ("antiwindup_strategy",) if target.is_set_up else ()
     values = [each for each in _values(gains, law) if each[0] not in stays]
     lines = [
-        *_comments(gains, _signed(gains), "#", known=target.is_set_up),
+        *_comments(gains, target, _signed(gains), "#"),
         f"# ros2 param load {target.node} FILE",
         f"{_key(target.node)}:",
         "  ros__parameters:",
@@ -216,7 +218,7 @@ def settings(gains: Gains, law: ProgramLaw, target: Target) -> str:
         if law.start.name and (known or law.start.needs):
             start = law.start.value(law.at(scaled, gains.law_period), present)
             values.append((law.start.name, number(start)))
-    return _written(law, _comments(gains, told, law.remark), values)
+    return _written(law, _comments(gains, target, told, law.remark), values)
 
 
 def _full_command(law: ProgramLaw, target: Target) -> float:
@@ -292,7 +294,7 @@ def launch_file(gains: Gains, target: Target) -> str:
     shown = [f"                    {json.dumps(n)}: {v!r}," for n, v in values.items()]
     topics = [f"                    {(name, to)!r}," for name, to in target.topics.items()]
     lines = [
-        *_comments(gains, ("ros2 launch FILE",), "#"),
+        *_comments(gains, target, ("ros2 launch FILE",), "#"),
         "from launch import LaunchDescription",
         "from launch_ros.actions import Node",
         "",
@@ -336,9 +338,13 @@ def _texts(found: Iterable[tuple[str, float | str | None]]) -> list[tuple[str, s
     ]
 
 
-def plain(gains: Gains) -> str:
-    """Return gains as lines of `key: value`, which is YAML."""
-    lines = [*_comments(gains, (), "#"), f"rule: {gains.rule}", f"form: {gains.form}"]
+def plain(gains: Gains, target: Target) -> str:
+    """Return gains as lines of `key: value`, which is YAML.
+
+    :param gains: what is written.
+    :param target: what is known of the loop.
+    """
+    lines = [*_comments(gains, target, (), "#"), f"rule: {gains.rule}", f"form: {gains.form}"]
     numbers = (f for f in result_fields(Gains) if f.kind is float)
     for each in (f for f in numbers if not f.optional):
         value = getattr(gains, each.name)
@@ -371,7 +377,7 @@ def _key(name: str) -> str:
     return f"'{name}'" if special or not _PLAIN.match(name.lstrip("/")) else name
 
 
-def _comments(gains: Gains, more: Sequence[str], remark: str, *, known: bool = False) -> list[str]:
+def _comments(gains: Gains, target: Target, more: Sequence[str], remark: str) -> list[str]:
     told = [
         f"Gains by the rule {gains.rule} of relay_autotune: Ms {gains.ms:.3g}, Mt {gains.mt:.3g}.",
         f"ISA form: kc {gains.kc:.6g} u/y, ti {gains.ti:.6g} s, td {gains.td:.6g} s, "
@@ -379,10 +385,32 @@ def _comments(gains: Gains, more: Sequence[str], remark: str, *, known: bool = F
     ]
     if gains.law:
         told.append(f"Designed for {gains.law} every {gains.law_period:.6g} s.")
-        if not known:
+        if not target.is_set_up:
             told[-1] += " If it runs at another period, export again with --sample-period."
-    told += gains.warnings
+    told += [*_predicted(gains, target.noise_std), *gains.warnings]
     return [f"{remark} {line}" for line in (*told, *more)]
+
+
+def _predicted(gains: Gains, noise_std: float) -> list[str]:
+    """Return sentences on what gains do on the model; those that are not known are left out."""
+    found = []
+    if math.isfinite(gains.settling_time):
+        jump = LAWS[gains.law or OWN_LAW].at(gains, gains.law_period).jump
+        found.append(
+            f"A step of the set-point overshoots by {percent(gains.overshoot)} %, settles within "
+            f"2 % after {digits(gains.settling_time, 3)} s, and moves the command at once by "
+            f"{digits(jump, 3)} u/y."
+        )
+    if math.isfinite(gains.noise_gain * noise_std):
+        found.append(
+            f"Noise of {digits(noise_std, 2)} y in the measurement makes one of "
+            f"{digits(gains.noise_gain * noise_std, 2)} u in the command (standard deviations)."
+        )
+    elif math.isfinite(gains.noise_gain):
+        found.append(
+            f"The command has {digits(gains.noise_gain, 3)} u/y times the measurement's noise."
+        )
+    return found
 
 
 def _signed(gains: Gains) -> list[str]:

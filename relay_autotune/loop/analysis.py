@@ -216,7 +216,7 @@ class Loop:
         if not sampled:
             u_r = u_r - self._kick(s)
         return (
-            ClosedLoop(time, inverse(y_r), inverse(u_r, self._first_command(kick=False))),
+            ClosedLoop(time, inverse(y_r), inverse(u_r, self._first_command())),
             ClosedLoop(time, inverse(y_d), inverse(u_d)),
         )
 
@@ -243,12 +243,12 @@ class Loop:
         """Return command per set-point by the derivative of the error alone."""
         return self.law.kick(s) if isinstance(self.law, SampledLaw) else 0.0 * s
 
-    def _first_command(self, *, kick: bool = True) -> float:
-        """Return the command just after a unit step of the set-point [u]."""
+    def _first_command(self) -> float:
+        """Return the command just after a unit step of the set-point, without kick [u]."""
         constants = (*self.model.time_constants, *self.law.times, self.law.period)
         shortest = min([abs(c) for c in constants if c != 0.0], default=1.0)
         s = np.array([1e9 / shortest], dtype=np.complex128)
-        first = self.law.from_setpoint(s) - (0.0 if kick else self._kick(s))
+        first = self.law.from_setpoint(s) - self._kick(s)
         return float(first[0].real)
 
     def figures(self, frequency: float) -> StepFigures:
@@ -319,7 +319,7 @@ class Loop:
         if self._has_instants(float(setpoint.time[1]) * size, size):
             return abs(float(command[0])) + _variation(command)
         added = law.kick_variation if isinstance(law, SampledLaw) else 0.0
-        return abs(self._first_command(kick=False)) + _variation(command) + added
+        return abs(self._first_command()) + _variation(command) + added
 
     def _horizon(self, frequency: float) -> float:
         """Return a first guess of how long the responses last [s]."""

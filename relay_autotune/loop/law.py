@@ -385,6 +385,14 @@ class SampledLaw:
         return np.asarray(self.derivative(back) * back**self.law.delay)
 
     @property
+    def jump(self) -> float:
+        """Command just after a unit step of the set-point, beside the law's delay [u/y]."""
+        first = self.gains.kc * self.gains.b + self.integral.top[0]
+        if self.law.slope is Slope.ERROR:
+            first += self.derivative.top[0]
+        return float(first)
+
+    @property
     def kick_variation(self) -> float:
         """Total variation of the command by the derivative of the error after a unit step."""
         if self.law.slope is not Slope.ERROR or self.gains.td == 0.0:

@@ -219,7 +219,7 @@ def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:
     known = options.sample_period > 0.0 and options.amplitude > 0.0
     if known and noise > _HELD * options.noise_share * options.amplitude:
         found.append(
-            f"the noise alone moves the command by {noise:.3g} (standard deviation), "
+            f"the noise alone moves the command by {noise:.3g} u (standard deviation), "
             f"{100.0 * noise / options.amplitude:.0f} % of half the command's range; filter the "
             "measurement, or ask for PI"
         )

@@ -97,6 +97,29 @@ def test_what_pid_controller_gets():
     }
 
 
+def test_an_export_says_what_was_predicted(capsys):
+    asked = ["--law", "ardupilot_rate", "--pid", "--noise-std", "0.02", "--amplitude", "0.5"]
+    for how in ("ardupilot_rate", "yaml"):
+        assert tune.main([*OVEN, *asked, "--export", how]) == 0
+        text = capsys.readouterr().out
+        made = tune_model(
+            TransferFunction.fopdt(1.65, 20.0, 10.0),
+            options=DesignOptions(
+                controller="pid", sample_period=0.5, law="ardupilot_rate", noise_std=0.02,
+                amplitude=0.5,
+            ),
+        )  # fmt: skip
+        # What the program does at the first sample of a step from rest.
+        first = LAWS["ardupilot_rate"].at(made, 0.5).running().step(1.0, 0.0)
+        predicted = [100.0 * made.overshoot, 2.0, made.settling_time, first]
+        predicted += [0.02, 0.02 * made.noise_gain]
+        told = re.findall(r"\d+(?:\.\d+)?", "".join(text.splitlines()[3:5]))
+        assert [float(word) for word in told] == pytest.approx(predicted, rel=0.03)
+    bare = exported(replace(gains(1.0, 2.0), noise_gain=3.0), "yaml", Target())
+    assert "# The command has 3.00 u/y times the measurement's noise." in bare
+    assert "A step of" not in bare
+
+
 def test_infinite_clamps_are_left_out():
     text = pid_controller(gains(0.82, 59.9), Target(command_max=5.0))
     assert "inf" not in text
@@ -161,7 +184,7 @@ def test_targets_that_cannot_be(wrong):
 
 
 def test_plain_lines():
-    found = yaml.safe_load(plain(gains(1e-5, 2.0)))
+    found = yaml.safe_load(plain(gains(1e-5, 2.0), Target()))
     assert found["kc"] == pytest.approx(1e-5)
     assert all(type(found[name]) is float for name in ("kc", "ti", "td", "p", "i", "d", "b", "ms"))
     assert (found["rule"], found["form"]) == ("imc", "isa")

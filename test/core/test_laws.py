@@ -207,6 +207,15 @@ def test_a_law_does_what_its_source_does(name, sign):
         assert running.step(r, y) == pytest.approx(source.step(r, y), rel=1e-9, abs=1e-9)
 
 
+@pytest.mark.parametrize("name", LAWS)
+def test_a_step_of_the_set_point_moves_the_command_at_once_as_its_source_does(name):
+    law = LAWS[name]
+    gains = law.best(WANTED, PERIOD)
+    source = Source(name, gains)
+    answers = [source.step(1.0, 0.0) for _ in range(1 + law.delay)]
+    assert law.at(gains, PERIOD).jump == pytest.approx(answers[-1], rel=1e-9)
+
+
 @pytest.mark.parametrize("tf", [0.0, 0.7])
 @pytest.mark.parametrize("name", LAWS)
 def test_its_transfer_functions_are_those_of_its_source(name, tf):

@@ -220,7 +220,8 @@ def test_gains_carry_what_the_user_must_know():
     loud = DesignOptions(noise_std=0.5, amplitude=1.0, sample_period=0.02)
     gains = design(DesignTask(model=model, options=loud), "ziegler_nichols")
     assert any("Ms is" in w and "above the 1.4" in w for w in gains.warnings)
-    assert any("of half the command's range" in w for w in gains.warnings)
+    told = f"moves the command by {0.5 * gains.noise_gain:.3g} u (standard deviation)"
+    assert any(told in w and "of half the command's range" in w for w in gains.warnings)
     gains = design(DesignTask(model=model), "robust")
     assert gains.warnings == ()
     # The noise of a controller whose sampling period is not known cannot be told.
