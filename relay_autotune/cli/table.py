@@ -86,17 +86,22 @@ def compared_lines(
         return beside(present, gains, model.model, width, analysis.added_delay)
 
 
-# Columns of a table with one line for each experiment, and their widths.
-_VERDICT, _NUMBER = 8, 8
-_NUMBERS = ("K_u", "w_u", "kc", "ti", "td", "Ms")
+# Numbers of a table with one line for each experiment: names, units and widths.
+_VERDICT = 8
+_NUMBERS = (
+    *(("K_u", "u/y", 7), ("w_u", "rad/s", 7), ("kc", "u/y", 7), ("ti", "s", 7), ("td", "s", 7)),
+    *(("tf", "s", 7), ("b", "", 4), ("every", "s", 6), ("Ms", "", 4)),
+)
 
 
 def heading(name_width: int) -> str:
-    """Return the line above :func:`rows`.
+    """Return the two lines above :func:`rows`.
 
     :param name_width: columns of the name.
     """
-    return _lines("", "verdict", _NUMBERS, name_width, WIDEST)[0]
+    names, units, _ = zip(*_NUMBERS, strict=True)
+    above = (("verdict", names), ("", units))
+    return "\n".join(_lines("", word, cells, name_width, WIDEST)[0] for word, cells in above)
 
 
 def rows(
@@ -116,9 +121,11 @@ def rows(
         model, gains = analysis.model, analysis.best_gains
         verdict = analysis.verdict.name.lower() if model is not None else "-"
         cells = [analysis.reason]
-        if model is not None and gains is not None:
+        if model is not None and gains is not None and analysis.shaping is not None:
             values = (model.ultimate_gain, model.ultimate_frequency, gains.kc, gains.ti, gains.td)
-            cells = [*map(digits, values), digits(gains.ms, 3)]
+            every = f"{analysis.shaping.task.options.sample_period:g}"
+            more = (digits(gains.tf), f"{gains.b:g}", every, digits(gains.ms, 3))
+            cells = [*map(digits, values), *more]
         lines += _lines(name, verdict, cells, name_width, width)
     return lines
 
@@ -129,7 +136,8 @@ def _lines(
     """Return numbers on a line, or a sentence on as many as it takes; lines in it stay whole."""
     begin = f"{name:<{name_width}}  {verdict:<{_VERDICT}}"
     if len(cells) > 1:
-        return ["".join([begin, *(f" {cell:>{_NUMBER}}" for cell in cells)])]
+        numbers = zip(cells, _NUMBERS, strict=True)
+        return ["".join([begin, *(f" {cell:>{wide}}" for cell, (_, _, wide) in numbers)]).rstrip()]
     first, *copied = cells[0].split("\n")
     parts = broken(first, max(width - len(begin) - 2, NARROWEST))
     indent = " " * len(begin)

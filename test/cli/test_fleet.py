@@ -63,14 +63,18 @@ def test_a_folder_of_bags_is_a_table_with_a_line_each(tmp_path, capsys, more):
     names = [f"a column called {k}" for k in "abcd"]
     (tmp_path / "unclear.csv").write_text(",".join(names) + "\n1,2,3,4\n2,3,4,5\n")
     status, out, err = run(capsys, "--rule", "imc", *more, tmp_path)
-    head, *rows = out.splitlines()
+    head, units, *rows = out.splitlines()
     # What of a column's name says that it may be chosen is not cut off.
     rows, unclear = rows[:3], rows[3:]
     assert unclear[0].split()[:2] == ["unclear.csv", "-"] and max(map(len, unclear[:-6])) < 100
     told = " ".join(" ".join(unclear).split())
     assert "'a column called d'; name two of them with --measurement NAME" in told
     assert "--command 'a column called c'" in unclear[-6]
-    assert head.split() == ["verdict", "K_u", "w_u", "kc", "ti", "td", "Ms"]
+    names = ["K_u", "w_u", "kc", "ti", "td", "tf", "b", "every", "Ms"]
+    assert head.split() == ["verdict", *names]
+    # Each unit ends where its name does.
+    ends = [head.index(f" {name}") + 1 + len(name) for name in ("K_u", "w_u", "kc", "ti", "every")]
+    assert [units[:end].split()[-1] for end in ends] == ["u/y", "rad/s", "u/y", "s", "s"]
     assert [row.split()[0] for row in rows] == ["bag_0", "bag_1", "broken.mcap"]
     _, json_out, _ = run(capsys, "--json", "--rule", "imc", STEP)
     (found,) = json.loads(json_out)["experiments"]
@@ -79,8 +83,9 @@ def test_a_folder_of_bags_is_a_table_with_a_line_each(tmp_path, capsys, more):
         verdict, *numbers = row.split()[1:]
         assert verdict == found["verdict"]
         told = dict(zip(head.split()[1:], map(float, numbers), strict=True))
-        for name in ("kc", "ti", "td"):
+        for name in ("kc", "ti", "td", "tf", "b"):
             assert told[name] == pytest.approx(gains[name], rel=1e-3)
+        assert f"a controller that runs every {told['every']:g} s" in gains["reason"]
     assert "broken.mcap  -" in rows[2] and len(rows[2]) < 100
     # The choice of columns counts as a matter of the command line.
     assert status == 2
