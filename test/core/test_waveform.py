@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fopdt_plant import FopdtPlant
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_experiments import record_of
@@ -232,6 +233,21 @@ def test_data_that_tell_nothing_are_refused_with_the_reason(measurement, command
     time = np.arange(measurement.size, dtype=float)
     with pytest.raises(IdentificationError, match=said):
         identify_waveform(Record(time, measurement, command))
+
+
+@pytest.mark.parametrize("exchanged", [False, True])
+def test_exchanged_columns_of_a_test_by_steps_are_named(exchanged):
+    time = np.arange(400.0)
+    command = np.array([0.0, 20.0, 50.0, 10.0])[np.arange(400) // 100]
+    plant = FopdtPlant(1.65, 20.0, 10.0)
+    measurement = np.array([0.0, *map(plant.advance, time[1:], command[:-1])])
+    columns = (command, measurement) if exchanged else (measurement, command)
+    try:
+        told = "; ".join(identify_waveform(Record(time, *columns), FOPDT).warnings)
+    except IdentificationError as error:
+        told = str(error)
+    assert ("moves in 3 of 400 samples and the command in " in told) == exchanged
+    assert ("the wrong way round" in told) == exchanged
 
 
 @pytest.mark.by_day(1)

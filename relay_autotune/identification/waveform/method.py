@@ -53,8 +53,10 @@ from relay_autotune.process.structures import FOPDT, TABLE
 from relay_autotune.record.excitation import at_its_ends, changes_within, smooth
 from relay_autotune.record.record import Input, PiecewiseConstant, Record, roughness
 
-# Number of samples from which even a coarse measurement takes more than two values.
-_ENOUGH_FOR_TWO = 20
+# Number of samples from which even a coarse measurement takes more than two values, and how many
+# times as often as it the command moves where the two are exchanged: in 90 recordings of plants
+# 1.6 times at most, and 7 times at least with exchanged columns of steps in an open loop.
+_ENOUGH_FOR_TWO, _EXCHANGED = 20, 4.0
 _LEAST_SAMPLES = 12
 # Largest number of samples that are fitted: beyond, noise does not limit what is known.
 _MOST_SAMPLES = 2_000_000
@@ -104,7 +106,7 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
         )
     inputs = [record.drive() for record in records]
     for record, u in zip(records, inputs, strict=True):
-        _require_content(record.time, record.measurement, u)
+        _require_content(record, u)
     # In units of its own range, so that no unit of measurement is too large or too small.
     scale = max(max(float(np.ptp(y)), float(np.abs(y).max()) * 1e-6) for y in _measured(records))
     problem = problem_of(
@@ -120,16 +122,20 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
     )
     samples, problem = problem.time.size, problem.thinned(_MOST_SAMPLES)
     sign = _sign(records)
-    fit = _explained(
-        problem, known, sign, scale, held=any(r.settings is not None for r in records)
-    )
+    alike = [told for told in map(_like_a_command, records) if told]
+    try:
+        fit = _explained(
+            problem, known, sign, scale, held=any(r.settings is not None for r in records)
+        )
+    except IdentificationError as error:
+        raise IdentificationError("; ".join([str(error), *alike])) from error
     if problem.time.size < samples:
         told = (
             f"of {samples} samples {problem.time.size} were fitted, evenly spread: more would "
             "take memory and add nothing"
         )
         fit = replace(fit, warnings=(*fit.warnings, told))
-    return report(records, fit)
+    return report(records, replace(fit, warnings=(*alike, *fit.warnings)))
 
 
 def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held: bool) -> Fit:
@@ -329,7 +335,8 @@ def _outliers(whole: Problem, problem: Problem, state: Trial) -> NDArray[np.bool
     return found
 
 
-def _require_content(time: FloatArray, y: FloatArray, u: Input) -> None:
+def _require_content(record: Record, u: Input) -> None:
+    time, y = record.time, record.measurement
     if y.size < _LEAST_SAMPLES:
         raise IdentificationError(
             f"the record holds {y.size} samples; a fit needs at least {_LEAST_SAMPLES}: "
@@ -347,9 +354,23 @@ def _require_content(time: FloatArray, y: FloatArray, u: Input) -> None:
             f"the measurement is constant at {y[0]:g} although the command changes: check the "
             "sensor, the actuator and that both topics belong to one loop"
         )
-    if y.size >= _ENOUGH_FOR_TWO and np.all((y == y.min()) | (y == y.max())):
-        raise IdentificationError(
-            f"the measurement takes two values only, {y.min():g} and {y.max():g}, as a relay's "
-            "command does: check that the two are not the wrong way round, or raise the amplitude "
-            "above the sensor's step"
-        )
+    if np.all((y == y.min()) | (y == y.max())) and (told := _like_a_command(record)):
+        raise IdentificationError(told)
+
+
+def _like_a_command(record: Record) -> str:
+    """Return what to look at where the measurement moves as commands do; empty: it does not."""
+    y, u = record.measurement, record.command
+    levels, (moves, changes) = np.unique(y), (np.count_nonzero(np.diff(x)) for x in (y, u))
+    if y.size < _ENOUGH_FOR_TWO:
+        return ""
+    if levels.size == 2:
+        how = f"takes two values only, {levels[0]:g} and {levels[1]:g}, as a relay's command does"
+    elif changes >= _EXCHANGED * moves and np.unique(u).size > levels.size:
+        how = f"moves in {moves} of {y.size} samples and the command in {changes}"
+    else:
+        return ""
+    return (
+        f"the measurement {how}: check that the two are not the wrong way round, or raise the "
+        "amplitude above the sensor's step"
+    )
