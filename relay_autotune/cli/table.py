@@ -353,7 +353,9 @@ def _fit(found: Identification) -> str:
         parts.append(f"{100.0 * fit.fit:.2f} %")
     if math.isfinite(fit.residual_rms):
         parts.append(f"residual {digits(fit.residual_rms, 3)} y rms")
-    if math.isfinite(fit.noise_std):
+    if fit.noise_std == 0.0:
+        parts.append("noise below the sensor's resolution")
+    elif math.isfinite(fit.noise_std):
         parts.append(f"noise {digits(fit.noise_std, 3)} y")
     if math.isfinite(fit.prediction):
         parts.append(f"prediction {digits(fit.prediction, 3)} y rms")

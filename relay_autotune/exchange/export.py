@@ -401,7 +401,7 @@ def _predicted(gains: Gains, noise_std: float) -> list[str]:
             f"2 % after {digits(gains.settling_time, 3)} s, and moves the command at once by "
             f"{digits(jump, 3)} u/y."
         )
-    if math.isfinite(gains.noise_gain * noise_std):
+    if gains.noise_gain * noise_std > 0.0:
         found.append(
             f"Noise of {digits(noise_std, 2)} y in the measurement makes one of "
             f"{digits(gains.noise_gain * noise_std, 2)} u in the command (standard deviations)."

@@ -420,7 +420,10 @@ def _rest_of(samples: LastSamples) -> str | Reason:
         return Code.REST_UNKNOWN()
     if not rest.is_steady:
         return Code.STILL_MOVING(motion=rest.motion, span=rest.span)
-    return f"{rest.mean:.6g} y with noise of {rest.noise_std:.2g} y over {duration(rest.span)}"
+    span = duration(rest.span)
+    if not rest.noise_std:
+        return f"{rest.mean:.6g} y for {span}; the noise is below the sensor's resolution"
+    return f"{rest.mean:.6g} y with noise of {rest.noise_std:.2g} y over {span}"
 
 
 def _limits_of(parameters: ExperimentParameters) -> str | Reason:

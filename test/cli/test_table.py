@@ -35,6 +35,17 @@ def test_no_model_is_wider_than_the_page(model):
     assert "(lag_complex, 12 % of the support)" in text
 
 
+def test_no_sensor_is_said_to_have_a_noise_of_zero():
+    found = identified("waveform", Estimate.of_model(ZERO))
+    for std, told in ((0.0, "noise below the sensor's resolution"), (0.25, "noise 0.250 y")):
+        (fit,) = [
+            line
+            for line in identification_lines(replace(found, fit=replace(found.fit, noise_std=std)))
+            if "noise" in line
+        ]
+        assert fit.split(maxsplit=1) == ["fit", told]
+
+
 def test_every_parameter_has_its_own_unit():
     """A frequency and a damping are no times, and an integrator's gain is a rate."""
     values = np.array((2.0, 0.5, 0.4, 0.1))

@@ -15,7 +15,7 @@ from virtual_tune import tuned
 
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.nodes import watch
-from relay_autotune.nodes.readiness import _expected
+from relay_autotune.nodes.readiness import _expected, _rest_of
 from relay_autotune.nodes.relay import RelayNode
 from relay_autotune.nodes.watch import (
     Arrival,
@@ -277,3 +277,14 @@ def test_a_silence_is_measured_by_the_rate_of_the_sensor_unless_it_is_given(give
     # A tune begins with no samples of its own.
     sensor.samples.forget()
     assert sensor.timeout == pytest.approx(timeout)
+
+
+@pytest.mark.parametrize(
+    ("noise", "told"),
+    [(0.0, "40 y for 10 s; the noise is below the sensor's resolution"), (0.1, "noise of 0.")],
+)
+def test_a_coarse_sensor_at_rest_is_not_said_to_be_without_noise(noise: float, told: str) -> None:
+    samples, begin = LastSamples(), 1_700_000_000_000_000_000
+    for k in range(101):
+        samples.add(40.0 + noise * (k % 3), begin + k * 100_000_000)
+    assert told in str(_rest_of(samples))
