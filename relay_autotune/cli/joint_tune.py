@@ -538,9 +538,10 @@ class JointLoop(Loop):
             say(PROGRAM, f"the gains are doubtful, so that --yes does not apply them: {doubt}")
             return None, ""
         loop, question, before = self._loop, "", dict[str, float]()
+        places = list(loop.places.values())
         if loop.why_not_moved:
             question = f"Set {self._places} of {loop.node}, without a step that verifies them?"
-            before = self._robot.values(loop.node, list(loop.places.values()))
+            before = self._robot.values(loop.node, places)
         self._start_controller()
         why_inactive = self._manager.still_active(loop.controller)
         self.client.why_lost = lambda: self.nodes.why_lost() or why_inactive()
@@ -557,8 +558,14 @@ class JointLoop(Loop):
             # It would have taken its step back.
             self.nodes.end("controller_node")
             raise GoneError(f"{error}; {self._put_back()}") from error
-        if in_force and question:
-            self._say_unverified(before)
+        if in_force:
+            now = self._robot.values(loop.node, places)
+            if question:
+                self._say_unverified(before, now)
+            if not self.options.export:
+                lines = ", ".join(f"{name} {value:.6g}" for name, value in now.items())
+                told = f"the gains are those of its parameter file again: put there {lines}"
+                tell("after a restart", told)
         return in_force, failed
 
     def _start_controller(self) -> None:
@@ -590,13 +597,13 @@ class JointLoop(Loop):
         self.nodes.end("controller_node")
         self.client.wait(lambda: not self.client.controllers(), _PATIENCE)
 
-    def _say_unverified(self, before: dict[str, float]) -> None:
+    def _say_unverified(self, before: dict[str, float], now: dict[str, float]) -> None:
         """Say which gains are in force without a step, and how to see what they do.
 
         :param before: those before, by the names of their parameters.
+        :param now: those in force.
         """
         loop = self._loop
-        now = self._robot.values(loop.node, list(before))
         tell("gains", f"in force, read back: {gains_text(now)}; before: {gains_text(before)}")
         moved = f"move it by {loop.above[-1]}" if loop.above else "give it a short trajectory"
         tell(

@@ -529,6 +529,29 @@ def test_a_proof_that_is_lost_tells_how_its_joint_is_left(monkeypatch, off, take
     assert did == ["controller_node", "controller_node"] + ["reference"] * (not off)
 
 
+@pytest.mark.parametrize("export", ["gains.yaml", None])
+def test_gains_that_only_run_are_told_with_what_keeps_them(monkeypatch, capsys, export) -> None:
+    loop = SimpleNamespace(
+        controller="pid", node="/pid", why_not_moved="",
+        places={"p": "gains.left.p", "i": "gains.left.i"},
+    )  # fmt: skip
+    tune = SimpleNamespace(
+        _loop=loop, _start_controller=lambda: None, space="/tune", client=SimpleNamespace(),
+        _manager=SimpleNamespace(still_active=lambda _: lambda: ""),
+        _robot=SimpleNamespace(values=lambda _, names: dict(zip(names, (1.25, 0.5), strict=True))),
+        options=SimpleNamespace(keep_gains=False, yes=True, export=export),
+        nodes=SimpleNamespace(why_lost=lambda: ""),
+    )  # fmt: skip
+    monkeypatch.setattr(joint_tune, "apply_at", lambda *_, **__: (True, ""))
+    assert JointLoop.apply(tune, "") == (True, "")
+    told = " ".join(capsys.readouterr().out.split())
+    kept = "parameter file again: put there gains.left.p 1.25, gains.left.i 0.5"
+    assert (kept in told) == (export is None)
+    monkeypatch.setattr(joint_tune, "apply_at", lambda *_, **__: (False, "it runs away"))
+    assert JointLoop.apply(tune, "") == (False, "it runs away")
+    assert "after a restart" not in capsys.readouterr().out
+
+
 def test_doubtful_gains_are_not_applied_unasked_and_that_is_no_failure(capsys) -> None:
     """The exit status is then that of doubtful gains, and not that of none."""
     tune = SimpleNamespace(options=SimpleNamespace(keep_gains=False, yes=True))
