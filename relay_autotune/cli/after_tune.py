@@ -616,7 +616,7 @@ class AfterTune(Tuned):
         with noted(lambda text: say(PROGRAM, text)) as (shown, leave):
             found = proof.made(step, bool(self.doubt), shown, leave)
         print()
-        for entry in found_entries(found, proof.noise_std):
+        for entry in found_entries(found):
             tell(*entry)
         if proof.rate is not None:
             tell(

@@ -17,7 +17,6 @@ command line is wrong.
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
@@ -172,7 +171,7 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
     :return: whether the gains are in force, and why their step failed; empty: it did not.
     """
     with Working("asking for the gains"):
-        present, (model, noise) = client.in_force(), client.identified()
+        present, (model, _) = client.in_force(), client.identified()
         gains, doubt = client.waiting()
     if not options.verify_only:
         _require_trust(doubt, options)
@@ -206,7 +205,7 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
     new = None if options.verify_only else gains
     with accepting, noted(lambda text: say(PROGRAM, text)) as (shown, leave):
         result, entries = verified(
-            client, step, shown, leave, new, noise,
+            client, step, shown, leave, new,
             load=options.load, patience=options.wait, stays=options.stays,
         )  # fmt: skip
         shown.clear()
@@ -221,7 +220,6 @@ def verified(
     tell: Callable[[str], None],
     leave: Callable[[], bool],
     new: Controller | None,
-    noise: float,
     *,
     load: float = 0.0,
     patience: float = REST_WITHIN,
@@ -234,7 +232,6 @@ def verified(
     :param tell: called with what is waited for.
     :param leave: returns True to end the verification.
     :param new: the gains that wait, to be put in force; None: those in force are tried.
-    :param noise: in which the step is seen [y]; NaN: not known.
     :param load: a second step, of the load [u]; 0: none.
     :param patience: how long to wait until the loop is at rest [s].
     :param stays: True if the controller_node goes on running.
@@ -244,10 +241,10 @@ def verified(
     try:
         now = client.in_force()
         unproven = not result.passed and new is not None and client.has(new)
-        entries = verdict_entries(result, now, stays=stays, noise_std=noise, unproven=unproven)
+        entries = verdict_entries(result, now, stays=stays, unproven=unproven)
     except LoopError as error:
         told = f"not known: {error}; before the proof: {_numbers(before)}"
-        entries = [*found_entries(result, noise), ("gains in force", told)]
+        entries = [*found_entries(result), ("gains in force", told)]
     return result, entries
 
 
@@ -277,7 +274,6 @@ def verdict_entries(
     present: Controller | None,
     *,
     stays: bool = True,
-    noise_std: float = math.nan,
     unproven: bool = False,
 ) -> list[tuple[str, str]]:
     """Return what a verification has found, and the gains in force after it: names and texts.
@@ -285,7 +281,6 @@ def verdict_entries(
     :param result: the `Verify.Result`.
     :param present: the gains in force after it.
     :param stays: True if the controller_node goes on running.
-    :param noise_std: of the measurement [y]; NaN: not known.
     :param unproven: True if the gains in force are new ones that have not passed.
     """
     now = _numbers(present)
@@ -293,7 +288,7 @@ def verdict_entries(
         now += f"; {PROGRAM} --revert takes those before"
     if unproven:
         now += "; these are the new ones, which are not proven: set those before yourself"
-    return [*found_entries(result, noise_std), ("gains in force", now)]
+    return [*found_entries(result), ("gains in force", now)]
 
 
 def _numbers(gains: Controller | None) -> str:
@@ -302,13 +297,12 @@ def _numbers(gains: Controller | None) -> str:
     return ", ".join(f"{n} {digits(getattr(gains, n))}" for n in ("kc", "ti", "td"))
 
 
-def found_entries(result: Any, noise_std: float = math.nan) -> list[tuple[str, str]]:
+def found_entries(result: Any) -> list[tuple[str, str]]:
     """Return verdict, response to each step and process of a verification: names and texts.
 
     :param result: the `Verify.Result`.
-    :param noise_std: of the measurement [y]; NaN: not known.
     """
-    from relay_autotune.control.verification import NOISE_ALLOWANCE, SETTLED
+    from relay_autotune.control.verification import SETTLED
 
     told = f"failed: {result.reason}"
     if result.passed:
@@ -318,22 +312,19 @@ def found_entries(result: Any, noise_std: float = math.nan) -> list[tuple[str, s
     if narrow and result.passed:
         told = f"passed, narrowly: {'; '.join(narrow)}"
     found = [("verdict", told)]
-    for step in result.steps:
+    for step, why in zip(result.steps, whys, strict=True):
         setpoint = step.kind == step.SETPOINT
-        moved = NOISE_ALLOWANCE * noise_std / abs(step.step) if setpoint else 0.0
-        unsure, within, predicted = "", f"{100.0 * SETTLED:.0f} %", "predicted"
-        if moved > _SEEN:
-            unsure = f" +- {100.0 * moved:.0f}"
-            # Noise leaves no narrower band, and the prediction has none.
-            within, predicted = f"{100.0 * (SETTLED + moved):.0f} %", f"predicted within {within}:"
+        # A controller_node of an older version does not tell what the noise adds.
+        band = float(why.values.get("settled_band", SETTLED))
+        moved = band - SETTLED
+        unsure = f" +- {100.0 * moved:.0f}" if moved > _SEEN else ""
         name = "set-point step" if setpoint else "load step"
         text = (
             f"{step.step:+g} {'y' if setpoint else 'u'}: overshoot "
             f"{100.0 * step.overshoot:.0f}{unsure} % "
             f"(predicted {100.0 * step.overshoot_predicted:.0f} %), settled within "
-            f"{within} after "
-            f"{duration(step.settling_time)} "
-            f"({predicted} {duration(step.settling_time_predicted)})"
+            f"{100.0 * band:.0f} % after {duration(step.settling_time)} "
+            f"(predicted {duration(step.settling_time_predicted)})"
         )
         found.append((name, text))
     if result.steps:

@@ -580,7 +580,7 @@ class GainsPage:
             good=result.passed,
             proof=(
                 ("gains", f"{_said(gains_from_message(message))}, at {time.strftime('%H:%M')}"),
-                *found_entries(result, proof.noise_std),
+                *found_entries(result),
             )
             if result.steps
             else live.told.proof,
@@ -635,9 +635,8 @@ class GainsPage:
     def _verify(self, wish: PageCommand, controller: GainsClient, new: Controller | None) -> None:
         live = self.live
         self._begin_step("")
-        _, noise = controller.identified()
         result, entries = verified(
-            controller, wish.step, lambda text: live.tell(status=text), self.leave, new, noise
+            controller, wish.step, lambda text: live.tell(status=text), self.leave, new
         )
         self._show_steps(controller.steps_of(result))
         live.rest(

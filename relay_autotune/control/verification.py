@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -78,7 +78,7 @@ class Response:
 
     :param overshoot: of a set-point step, beyond it, as a fraction; of a load step, the largest
         deviation to the other side, as a fraction of the largest.
-    :param settling_time: time until the error stays within 5 % of its largest value [s].
+    :param settling_time: time until the error stays within :func:`settled_band` [s].
     :param iae: integral of the absolute error [y s].
     :param largest: largest deviation from the start [y].
     """
@@ -317,6 +317,15 @@ def _edge(control: Control, model: TransferFunction, end: float) -> float:
     return low * abs(end)
 
 
+def settled_band(size: float, noise_std: float) -> float:
+    """Return the error within which a response has settled [y].
+
+    :param size: the step of the set-point, or the largest deviation after one of the load [y].
+    :param noise_std: standard deviation of the noise [y].
+    """
+    return SETTLED * size + NOISE_ALLOWANCE * noise_std
+
+
 def describe(
     time: FloatArray, deviation: FloatArray, step: Step, noise_std: float = 0.0
 ) -> Response:
@@ -328,17 +337,17 @@ def describe(
     :param noise_std: standard deviation of the noise, which does not count as error [y].
     """
     error = step.setpoint - deviation
-    allowed, at_peak = NOISE_ALLOWANCE * noise_std, _AT_PEAK * noise_std
+    largest, at_peak = float(np.max(np.abs(deviation))), _AT_PEAK * noise_std
     if step.setpoint != 0.0:
         way = deviation / step.setpoint
         overshoot = max(0.0, float(way.max()) - 1.0 - at_peak / abs(step.setpoint))
-        band = SETTLED * abs(step.setpoint) + allowed
     else:
         side = 1.0 if deviation.max() >= -deviation.min() else -1.0
         top, other = float((side * deviation).max()), float((-side * deviation).max())
         overshoot = max(0.0, other - at_peak) / top if top > 0.0 else 0.0
-        band = SETTLED * top + allowed
-    outside = np.flatnonzero(np.abs(error) > band)
+    outside = np.flatnonzero(
+        np.abs(error) > settled_band(abs(step.setpoint) or largest, noise_std)
+    )
     settled = 0 if outside.size == 0 else min(int(outside[-1]) + 1, time.size - 1)
     # Noise alone has a mean absolute value of sqrt(2/pi) standard deviations.
     absolute = np.maximum(np.abs(error) - math.sqrt(2.0 / math.pi) * noise_std, 0.0)
@@ -346,7 +355,7 @@ def describe(
         overshoot=overshoot,
         settling_time=float(time[settled] - time[0]),
         iae=float(np.sum(0.5 * (absolute[1:] + absolute[:-1]) * np.diff(time))),
-        largest=float(np.max(np.abs(deviation))),
+        largest=largest,
     )
 
 
@@ -394,10 +403,13 @@ def compare(
     rms = math.sqrt(float(np.mean((deviation - predicted) ** 2)))
     measured = describe(time, deviation, step, noise_std)
     expected = describe(time, predicted, step)
+    size = abs(step.setpoint) or measured.largest
+    band = settled_band(size, noise_std) / size
+    in_band = describe(time, predicted, step, noise_std).settling_time
     # White noise leaves the gain this uncertain.
     slope = (predict(_SLIGHTLY * ratio) - predict(ratio)) / math.log(_SLIGHTLY)
-    size = float(np.linalg.norm(slope))
-    unsure = NOISE_ALLOWANCE * ratio * noise_std / size if size > 0.0 else 0.0
+    seen = float(np.linalg.norm(slope))
+    unsure = NOISE_ALLOWANCE * ratio * noise_std / seen if seen > 0.0 else 0.0
     ms, ms_predicted = _ms(control, scaled(model, ratio)), _ms(control, model)
     spared = (NOISE_ALLOWANCE - _AT_PEAK) * noise_std / (abs(step.setpoint) or expected.largest)
     compared = _comparisons(measured, expected, spared, ratio, ms, ms_predicted, time)
@@ -406,8 +418,7 @@ def compare(
     narrow = [c.numbers for c in compared if c.taken > _NARROW]
     numbers = (
         f"overshoot {measured.overshoot:.0%} (predicted {expected.overshoot:.0%}), "
-        f"settling to {100.0 * SETTLED:.0f} % {measured.settling_time:.3g} s "
-        f"({expected.settling_time:.3g} s), "
+        f"settling to {100.0 * band:.0f} % {measured.settling_time:.3g} s ({in_band:.3g} s), "
         f"IAE {measured.iae:.3g} ({expected.iae:.3g}), Ms {ms:.2f} ({ms_predicted:.2f}), "
         f"gain {ratio:.2f} times the model's"
     )
@@ -418,10 +429,11 @@ def compare(
         why = Code.NARROWLY(narrow=", ".join(narrow), numbers=numbers)
     return Comparison(
         passed=not problems,
-        # Beside the sentence, for those who tell the gain by itself.
-        why=why.plus(gain_uncertainty=unsure),
+        # Beside the sentence, for those who tell the numbers by themselves.
+        why=why.plus(gain_uncertainty=unsure, settled_band=band),
         measured=measured,
-        expected=expected,
+        # What is told is within the band of the measured one; the limit is without noise.
+        expected=replace(expected, settling_time=in_band),
         predicted=predicted,
         fit=1.0 - rms / spread if spread > 0.0 else math.nan,
         gain_ratio=ratio,

@@ -98,15 +98,18 @@ def test_a_verdict_has_five_lines() -> None:
 
 def test_in_noise_a_proof_says_how_far_it_moves_the_overshoot_and_widens_the_band() -> None:
     """A step was said to be within 5 % long before it could be: noise was taken from its error."""
-    result = Verify.Result(passed=True, reason="long", steps=[step()])
-    noisy = "\n".join(laid_out(found_entries(result, 0.01), 120))
-    assert "overshoot 10 +- 6 % (predicted 11 %)" in noisy
-    assert "settled within 11 % after 3.8 s (predicted within 5 %: 4.2 s)" in " ".join(
-        noisy.split()
+    noisy, load = step(), step(kind=Verification.LOAD, step=0.3)
+    wide = Code.AS_PREDICTED(numbers="numbers").plus(settled_band=0.11)
+    for each in (noisy, load):
+        fill_reason(each.why, wide)
+    result = Verify.Result(passed=True, reason="long", steps=[noisy, load, step()])
+    found = dict(enumerate(text for _, text in found_entries(result)))
+    told = (
+        "overshoot 10 +- 6 % (predicted 11 %), settled within 11 % after 3.8 s (predicted 4.2 s)"
     )
-    assert "overshoot 10 % (predicted 11 %)" in "\n".join(
-        laid_out(found_entries(result, 0.004), 99)
-    )
+    assert found[1] == f"+0.5 y: {told}"
+    assert found[2] == f"+0.3 u: {told}"
+    assert "overshoot 10 % (predicted 11 %), settled within 5 % after" in found[3]
 
 
 def test_the_gain_of_the_process_has_its_uncertainty_where_the_noise_is_known() -> None:
