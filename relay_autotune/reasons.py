@@ -659,7 +659,7 @@ class Code(enum.IntEnum):
     )
     """Another name or namespace, or it is not running."""
     FEW_SAMPLES = _Row(
-        508, "only {samples} samples have come with a command, expected {needed}", transient=True
+        508, "only {samples} of {needed} samples have come with a command", transient=True
     )
     """The loop has just begun to run."""
     NOBODY_SUBSCRIBES = _Row(509, "nobody subscribes to {topic}[ {since}]", transient=True)

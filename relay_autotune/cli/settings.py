@@ -190,12 +190,12 @@ SETTINGS = (
     Setting("yes", False, loops=_ALL).means(
         "do not ask, for scripts; gains are then proven with --verify alone"
     ),
-    Setting("export", "", metavar="FILE", loops=(*_JOINTS, Kind.TOPICS)).means(
-        "write the gains for controller_node, or for the controller of the joint; an existing "
-        "file is refused at once"
+    Setting("export", "", flag="output", metavar="FILE", loops=(*_JOINTS, Kind.TOPICS)).means(
+        "write the gains for controller_node, the program of --law, or the controller of the "
+        "joint; an existing file is refused at once"
     ),
     Setting("accept_doubtful", False, loops=(*_JOINTS, Kind.TOPICS)).means(
-        "with --export: also gains that are doubtful"
+        "with --output: also gains that are doubtful"
     ),
     Setting("controller", "", metavar="NAME", loops=_JOINTS).means(
         "an active pid_controller, or with --open a joint_trajectory_controller; of several "
@@ -450,6 +450,8 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     groups = {kind: parser.add_argument_group(*told) for kind, told in _GROUPS.items()}
     for each in SETTINGS:
         each.add_to(groups.get(each.loops[-1], parser))
+    # The name that --output had in scripts of before.
+    parser.add_argument("--export", help=argparse.SUPPRESS)
 
 
 def kind_of(options: argparse.Namespace) -> Kind:

@@ -97,10 +97,11 @@ def _require_consistent(parser: argparse.ArgumentParser, options: argparse.Names
     if options.web and (options.dry_run or options.json or options.report or options.export):
         parser.error(
             "--web has check, result, report and exports on its page: leave out --dry-run, "
-            "--json, --report and --export"
+            "--json, --report and --output"
         )
     if options.export in EXPORTS:
-        parser.error(f"--export takes a file to write, such as gains.yaml, not {options.export}")
+        parser.error(f"--export takes a file; give the program as --law {options.export}, and the "
+                     "file as --output FILE")  # fmt: skip
     if options.step is not None and (
         options.verify is False or (options.yes and not options.verify)
     ):

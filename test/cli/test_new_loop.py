@@ -160,13 +160,14 @@ def test_no_two_joints_share_the_namespace_of_their_nodes() -> None:
 
 
 def test_a_file_that_exists_is_noticed_before_anything_is_looked_at(tmp_path, capsys) -> None:
-    given = ["--controller", "pid", "--joint", "wheel", "--yes", "--export"]
+    given = ["--controller", "pid", "--joint", "wheel", "--yes"]
     (tmp_path / "gains.yaml").write_text("mine")
-    for name, told in (
-        ("gains.yaml", "exists already"),
-        ("none/gains.yaml", "no writable"),
+    for flag, name, told in (
+        ("--output", "gains.yaml", "exists already"),
+        ("--export", "gains.yaml", "exists already"),
+        ("--output", "none/gains.yaml", "no writable"),
     ):
-        assert tune_loop.main([*given, str(tmp_path / name)]) == 2
+        assert tune_loop.main([*given, flag, str(tmp_path / name)]) == 2
         assert told in capsys.readouterr().err
     assert (tmp_path / "gains.yaml").read_text() == "mine"
 
@@ -412,6 +413,7 @@ def test_neither_yes_nor_a_law_becomes_the_name_of_a_file(
     assert asked_for_file("Write", EXPORTS) == ""
     with pytest.raises(SystemExit):
         tune_loop.main(["--export", "iec_61131_3_pid"])
+    assert "--law iec_61131_3_pid, and the file as --output FILE" in capsys.readouterr().err
 
 
 def test_what_failed_names_the_flag_and_no_node_that_ends_with_the_command() -> None:

@@ -69,7 +69,8 @@ def test_an_error_carries_a_reason_or_a_sentence():
 def test_a_sentence_alone_tells_whether_it_may_pass():
     wrapped = f"the gains of x are not in force: {Code.GAINS_AT_WORK()}; try later"
     assert may_pass(wrapped)
-    assert may_pass(str(Code.FEW_SAMPLES(samples=3, needed=50)))
+    few = str(Code.FEW_SAMPLES(samples=1, needed=50))
+    assert may_pass(few) and few == "only 1 of 50 samples have come with a command"
     assert not may_pass(str(Code.NOT_AUTOMATIC())) and not may_pass("")
 
 

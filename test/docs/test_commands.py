@@ -146,7 +146,7 @@ def check_own(words: list[str]) -> None:
     if parser is None:
         return
     given = [w for w in words[1:] if w != "..."]
-    if given and given[-1] in ("--lambda", "--export"):
+    if given and given[-1] in ("--lambda", "--export", "--output"):
         # The text names a flag alone.
         assert given[-1] in parser().format_help()
         return
