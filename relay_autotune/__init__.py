@@ -30,6 +30,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from relay_autotune.analysis import analyse, analyse_jointly
+    from relay_autotune.control.controller import simulate_closed_loop
     from relay_autotune.errors import RelayAutotuneError
     from relay_autotune.exchange.models import to_control
     from relay_autotune.experiment.experiment import RelayExperiment
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from relay_autotune.identification.methods import METHODS, identify
     from relay_autotune.identification.result import Identification
     from relay_autotune.loop.gains import Controller, Gains
-    from relay_autotune.loop.sampled import simulate_closed_loop
     from relay_autotune.process.structures import STRUCTURES
     from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.process.ultimate import ultimate_point
@@ -53,6 +53,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "analysis": ("analyse", "analyse_jointly"),
     "result": ("Analysis",),
+    "control.controller": ("simulate_closed_loop",),
     "recordings": ("read_records",),
     "errors": ("RelayAutotuneError",),
     "identification.known": ("Known",),
@@ -66,7 +67,6 @@ _HOMES = {
     "experiment.parameters": ("ExperimentParameters",),
     "report": ("draw", "write_report"),
     "tuning": ("RULES", "Controller", "DesignOptions", "Gains", "tune"),
-    "loop.sampled": ("simulate_closed_loop",),
     "process.ultimate": ("ultimate_point",),
     "process.virtual_process": ("Disturbances", "VirtualProcess"),
 }

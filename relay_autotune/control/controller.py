@@ -28,7 +28,14 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.law import LawRate, RunningLaw, SampledLaw
-from relay_autotune.loop.sampled import UNLIMITED, ClosedLoop, Limits, PidLaw, filter_matrices
+from relay_autotune.loop.sampled import (
+    UNLIMITED,
+    ClosedLoop,
+    Limits,
+    PidLaw,
+    filter_matrices,
+    require_period,
+)
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
 
@@ -291,7 +298,9 @@ def run_loop(
     *,
     setpoint: float = 0.0,
     load: float = 0.0,
+    load_time: float = 0.0,
     limits: Limits = UNLIMITED,
+    noise: FloatArray | None = None,
 ) -> ClosedLoop:
     """Simulate a controller on the exact process, from rest, after steps of set-point and load.
 
@@ -300,7 +309,9 @@ def run_loop(
     :param time: instants of the samples [s], increasing, the first at the step, shape (n,).
     :param setpoint: step of the set-point [y].
     :param load: step added to the command [u].
+    :param load_time: when it enters, after the first sample [s].
     :param limits: range of the command, as deviations [u].
+    :param noise: on the measurement at each run of the controller [y], shape (n,); None: none.
     """
     plant, samples = Plant(model), time - time[0]
     controller = running(control.rate, control.gains, 0.0, limits=limits)
@@ -311,18 +322,74 @@ def run_loop(
         interval = control.rate.period
         runs = interval * np.arange(int(samples[-1] / interval) + 1)
         until = np.searchsorted(runs, samples, side="right")
+    seen = np.zeros(runs.size) if noise is None else noise
     controller.step(-interval, 0.0, 0.0)
     measurement, command = np.empty(time.size), np.empty(time.size)
     done, applied, y = 0, 0.0, 0.0
     for k, t in enumerate(samples):
-        for run in runs[done : until[k]]:
-            y = plant.advance(float(run), applied)
-            applied = controller.step(float(run), setpoint, y) + load
+        for n in range(done, until[k]):
+            run = float(runs[n])
+            y = plant.advance(run, applied)
+            applied = controller.step(run, setpoint, float(y + seen[n]))
+            applied += load if run + interval > load_time else 0.0
         done = until[k]
         if runs[done - 1] != t:
             y = plant.advance(float(t), applied)
         measurement[k], command[k] = y, controller.command
     return ClosedLoop(time, measurement, command)
+
+
+def simulate_closed_loop(
+    controller: Controller | SampledLaw,
+    model: TransferFunction,
+    *,
+    period: float,
+    duration: float,
+    setpoint: float = 0.0,
+    load: float = 0.0,
+    load_time: float = 0.0,
+    low: float = -math.inf,
+    high: float = math.inf,
+    noise: FloatArray | None = None,
+) -> ClosedLoop:
+    """Run a controller at its sampling period; the process is exact between samples.
+
+    >>> from relay_autotune import Controller, TransferFunction, simulate_closed_loop
+    >>> oven = TransferFunction.fopdt(1.65, 20.0, 10.0)
+    >>> run = simulate_closed_loop(
+    ...     Controller(kc=0.6, ti=20.0), oven, period=0.5, duration=300.0, setpoint=1.0)
+    >>> print(f"{run.measurement[-1]:.3f} y, {run.command[-1]:.3f} u")
+    1.000 y, 0.606 u
+
+    :param controller: PI or PID gains, which our own law runs, or another law with its gains.
+    :param model: the process, at rest, without the half period that a design adds to it.
+    :param period: sampling period [s].
+    :param duration: s.
+    :param setpoint: step of the set-point at t = 0 [y].
+    :param load: step of the load at the process input [u].
+    :param load_time: instant of that step [s].
+    :param low: least command [u].
+    :param high: largest command [u].
+    :param noise: noise on each sample of the controller [y], shape (n,); None: no noise.
+    :raises TuningError: if the period is not positive or the limits leave no range.
+    """
+    require_period(period)
+    control = (
+        Control(controller)
+        if isinstance(controller, Controller)
+        else Control(controller.gains, LawRate(controller.law, period))
+    )
+    time = np.arange(int(duration / period) + 1, dtype=np.float64) * period
+    return run_loop(
+        control,
+        model,
+        time,
+        setpoint=setpoint,
+        load=load,
+        load_time=load_time,
+        limits=Limits(low, high),
+        noise=noise,
+    )
 
 
 def scaled(model: TransferFunction, factor: float) -> TransferFunction:

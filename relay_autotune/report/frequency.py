@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
+from relay_autotune.control.controller import simulate_closed_loop
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.result import Identification
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.laws import LAWS
-from relay_autotune.loop.sampled import ClosedLoop, simulate_closed_loop
+from relay_autotune.loop.sampled import ClosedLoop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.report.case import Case, EstimatedQuantity, in_loop, ultimate_of
@@ -529,7 +530,7 @@ def simulated(gains: Controller, model: TransferFunction, half: float) -> Closed
     if law is not None and 2.0 * half < _MOST_SAMPLES * period:
         held = replace(model, dead_time=max(model.dead_time - law.lag(period), 0.0))
         return simulate_closed_loop(
-            law.at(gains, period).running(), held, period=period, duration=2.0 * half,
+            law.at(gains, period), held, period=period, duration=2.0 * half,
             setpoint=1.0, load=load, load_time=half,
         )  # fmt: skip
     fine = min(half / _SAMPLES, max(gains.tf, model.dead_time) / 5.0 or math.inf)

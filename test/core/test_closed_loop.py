@@ -11,17 +11,13 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from relay_autotune.control.controller import PidController, simulate_closed_loop
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop, analyse_loop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.law import LawRate
 from relay_autotune.loop.laws import LAWS, OWN_LAW
-from relay_autotune.loop.sampled import (
-    Limits,
-    SampledPid,
-    filter_matrices,
-    simulate_closed_loop,
-)
+from relay_autotune.loop.sampled import filter_matrices
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.candidates import filters_of
 
@@ -81,17 +77,18 @@ def test_the_noise_in_the_command_is_what_was_predicted(period):
 
 
 def test_without_a_filter_the_derivative_is_the_difference_quotient():
-    law = SampledPid(Controller(2.0, 0.0, 0.5), 0.1)
-    law.step(0.0, 1.0)
-    assert law.step(0.0, 1.3) == pytest.approx(-2.0 * (1.3 + 0.5 * 3.0))
+    law = PidController(Controller(2.0, 0.0, 0.5), 0.0)
+    for t, y in ((-0.1, 0.0), (0.0, 1.0), (0.1, 1.3)):
+        command = law.step(t, 0.0, y)
+    assert command == pytest.approx(-2.0 * (1.3 + 0.5 * 3.0))
 
 
 def test_the_filter_lags_by_its_time_constant_at_any_period():
     # On a ramp the filtered value is late by tf, and its slope is the ramp's.
     for period in (0.05, 0.5, 5.0):
-        law = SampledPid(Controller(1.0, 0.0, 0.0, 2.0), period)
+        law = PidController(Controller(1.0, 0.0, 0.0, 2.0), 0.0)
         for k in range(int(60.0 / period)):
-            command = law.step(0.0, k * period)
+            command = law.step(k * period, 0.0, k * period)
         assert command == pytest.approx(-(k * period - 2.0), abs=1e-6)
 
 
@@ -123,9 +120,9 @@ def test_a_slow_filter_leaves_the_noise_of_its_bandwidth(ratio):
 def test_a_period_or_limits_without_sense_are_refused():
     for bad in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(TuningError, match="sampling period"):
-            SampledPid(PI, bad)
+            simulate_closed_loop(PI, MODEL, period=bad, duration=1.0)
     with pytest.raises(TuningError, match="no range"):
-        SampledPid(PI, 1.0, Limits(1.0, 1.0))
+        simulate_closed_loop(PI, MODEL, period=1.0, duration=1.0, low=1.0, high=1.0)
 
 
 def test_the_integrated_error_is_that_of_the_samples():

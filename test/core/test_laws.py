@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from functools import partial
@@ -13,14 +14,20 @@ import numpy as np
 import pytest
 from fopdt_plant import FopdtPlant
 
-from relay_autotune.control.controller import Control, LawController, run_loop
+from relay_autotune.control.controller import (
+    Control,
+    LawController,
+    PidController,
+    run_loop,
+    simulate_closed_loop,
+)
 from relay_autotune.control.verification import Step, compare, plan
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.law import LawRate
 from relay_autotune.loop.laws import LAWS
-from relay_autotune.loop.sampled import Limits, SampledPid, simulate_closed_loop
+from relay_autotune.loop.sampled import Limits
 from relay_autotune.process.structures import INTEGRATOR_LAG
 from relay_autotune.process.transfer_function import TransferFunction
 
@@ -147,10 +154,11 @@ def oscat(s, h):
 
 def our_own(s, h):
     gains = Controller(**s)
-    law = SampledPid(gains, h)
-    while True:
+    node = PidController(gains, 0.0)
+    node.step(-h, 0.0, 0.0)
+    for k in itertools.count():
         r, y = yield
-        yield law.step(r, y)
+        yield node.step(k * h, r, y)
 
 
 STRATEGIES = ("none", "legacy", "back_calculation", "conditional_integration")
@@ -270,9 +278,7 @@ def test_responses_and_figures_are_those_of_a_simulation(model, ti, period):
     found = Loop(sampled, model).performance()
     count = int(200.0 / period)
     setpoint, load = (
-        simulate_closed_loop(
-            sampled.running(), model, period=period, duration=count * period, **step
-        )
+        simulate_closed_loop(sampled, model, period=period, duration=count * period, **step)
         for step in ({"setpoint": 1.0}, {"load": 1.0, "load_time": -1.0})
     )
     responses = Loop(sampled, model).step_responses(2 * count * period, 2 * count)
@@ -290,7 +296,7 @@ def test_a_law_far_faster_than_its_loop_has_the_effort_of_its_simulation(name):
     """So many samples are not computed one by one, and the derivative kicks in a few of them."""
     period = 1e-3
     law = LAWS[name].at(LAWS[name].best(Controller(1.0, 2.5, 0.1, 0.02), period), period)
-    run = simulate_closed_loop(law.running(), PROCESS, period=period, duration=20.0, setpoint=1.0)
+    run = simulate_closed_loop(law, PROCESS, period=period, duration=20.0, setpoint=1.0)
     effort = abs(run.command[0]) + np.abs(np.diff(run.command)).sum()
     figures = Loop(law, PROCESS).performance()
     # What comes back of a plain derivative's kick lasts one sample, too, and is not resolved.
@@ -305,7 +311,7 @@ def test_noise_reaches_the_command_as_said():
     sampled = law.at(gains, PERIOD)
     noise = np.random.default_rng(1).standard_normal(6000)
     run = simulate_closed_loop(
-        sampled.running(), PROCESS, period=PERIOD, duration=5999 * PERIOD, noise=noise
+        sampled, PROCESS, period=PERIOD, duration=5999 * PERIOD, noise=noise
     )
     said = Loop(sampled, PROCESS).noise_gain()
     assert np.std(run.command) == pytest.approx(said, rel=0.04)

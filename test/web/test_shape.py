@@ -19,9 +19,9 @@ from relay_autotune import tuning
 from relay_autotune.analysis import analyse
 from relay_autotune.cli import arguments, replay
 from relay_autotune.cli.arguments import as_typed
+from relay_autotune.control.controller import simulate_closed_loop
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.laws import OWN_LAW
-from relay_autotune.loop.sampled import simulate_closed_loop
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import Case, given_model
