@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import stdtrit
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
@@ -21,6 +22,14 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import NORMAL_95
 
 _DIFFERENCE = 1e-6
+
+
+def student_95(degrees: int) -> float:
+    """Return half the width of a 95 % interval by Student's distribution, in standard deviations.
+
+    :param degrees: of freedom; below 1 counts as 1.
+    """
+    return float(stdtrit(max(degrees, 1), 0.975))
 
 
 def jacobian(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -477,8 +477,8 @@ def cycle_bounds(record: Record) -> tuple[int, ...]:
 class LimitCycle(CycleFeatures):
     """Averages over the cycles that agree, or over the last ones if none do."""
 
-    # Standard deviation of each of the features between the cycles, by name; 0 for one cycle.
-    std: dict[str, float] = field(default_factory=dict)
+    # Standard deviation of the period between the cycles [s]; 0 for one cycle.
+    period_std: float = 0.0
     cycles: tuple[int, ...] = result_field("", ())
     """Indices of the cycles averaged."""
     converged: bool = result_field("", False)
@@ -506,10 +506,9 @@ def limit_cycle(source: Record | Sequence[Cycle]) -> LimitCycle:
         )
     chosen, converged = _steady_cycles(cycles)
     values = {name: np.array([getattr(c, name) for c in chosen]) for name in _AVERAGED}
-    spread = {n: float(np.std(v, ddof=1)) if v.size > 1 else 0.0 for n, v in values.items()}
     return LimitCycle(
         **{name: float(np.mean(v)) for name, v in values.items()},
-        std=spread,
+        period_std=float(np.std(values["period"], ddof=1)) if len(chosen) > 1 else 0.0,
         cycles=tuple(c.index for c in chosen),
         converged=converged,
     )

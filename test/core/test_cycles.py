@@ -184,8 +184,7 @@ def test_the_limit_cycle_is_the_last_run_of_converged_cycles_and_those_they_agre
     found = limit_cycle(cycles)
     assert found.cycles == (2, 3, 4, 5)
     assert found.period == 13.5
-    assert found.std["period"] == pytest.approx(np.std([12, 13, 14, 15], ddof=1))
-    assert found.std["peak_max"] == 0.0
+    assert found.period_std == pytest.approx(np.std([12, 13, 14, 15], ddof=1))
     assert found.converged
 
 
@@ -193,7 +192,7 @@ def test_without_convergence_the_last_cycles_count():
     found = limit_cycle([replace(CYCLE, index=k) for k in range(5)])
     assert found.cycles == (2, 3, 4)
     assert not found.converged
-    assert limit_cycle([CYCLE]).std["period"] == 0.0
+    assert limit_cycle([CYCLE]).period_std == 0.0
 
 
 def test_disturbed_cycles_are_left_out_if_others_remain():

@@ -60,7 +60,7 @@ UNTOLD = {
             "halves",
         )
     ),
-    (LimitCycle, "std"),
+    (LimitCycle, "period_std"),
 }
 POSITIVE = st.floats(1e-3, 1e3)
 # What is unprintable comes back visible.

@@ -13,8 +13,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import stdtrit
 
+from relay_autotune.identification.estimate import student_95
 from relay_autotune.identification.judgement.assessment import unexplained_share
 from relay_autotune.identification.judgement.checks import (
     lost_effect,
@@ -62,9 +62,9 @@ def _limit_cycle(evidence: Evidence) -> Measured | None:
     else:
         seen = limit_cycle(evidence.record)
         count = len(seen.cycles)
-        scatter = stdtrit(max(count - 1, 1), 0.975) * seen.std["period"] / math.sqrt(count)
+        scatter = student_95(count - 1) * seen.period_std / math.sqrt(count)
         # What the scatter of the recorded periods does not explain.
-        away = max(abs(validation.period) - float(scatter) / seen.period, 0.0)
+        away = max(abs(validation.period) - scatter / seen.period, 0.0)
         than = "longer" if validation.period > 0.0 else "shorter"
         part = digits(100.0 * abs(validation.period), 3)
         said = f"oscillates with a period {part} % {than} than the recorded one"

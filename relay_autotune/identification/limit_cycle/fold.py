@@ -25,11 +25,10 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor
 from scipy.linalg.lapack import dpotrs
 from scipy.sparse import csr_array
-from scipy.special import stdtrit
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.estimate import carried
+from relay_autotune.identification.estimate import carried, student_95
 from relay_autotune.record.cycles import cycle_bounds, limit_cycle, settings_of
 from relay_autotune.record.record import Record, RelaySettings, cached_on_record
 from relay_autotune.scalar import minimum_near
@@ -377,7 +376,7 @@ class Reading:
     @property
     def quantile(self) -> float:
         """Half the width of a 95 % interval in standard deviations."""
-        return float(stdtrit(max(self.cycles - 1, 1), 0.975))
+        return student_95(self.cycles - 1)
 
     @property
     def std(self) -> FloatArray:

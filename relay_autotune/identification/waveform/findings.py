@@ -13,11 +13,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import stdtrit
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
-from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.estimate import Estimate, student_95
 from relay_autotune.identification.result import (
     FitReport,
     Identification,
@@ -86,7 +85,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         whiteness_p=math.nan if exact else ljung_box(residual),
         prediction=scale * _prediction(records, problem, state),
     )
-    quantile = float(stdtrit(max(n - state.parameters, 1), 0.975))
+    quantile = student_95(n - state.parameters)
     warnings = (*fit.warnings, *_warnings(records, quality, fit, residual))
     found = identified(
         "waveform",
