@@ -369,9 +369,10 @@ class Answers:
                 UNITS[setting.unit] = unit
             return setting.read(text)
 
+        lacking = ", ".join(flag_of(each) for each in self._asked if self[each.name] is None)
         value = asked(
             f"{setting.question} [{setting.unit}]" + f", {seen}" * bool(seen),
-            flag_of(setting), "", example, read,
+            lacking, "", example, read,
             lambda found: self.why_impossible(name, found), pair=setting.ends > 1, back=back,
         )  # fmt: skip
         self.take({name: value}, "typed")

@@ -477,7 +477,7 @@ def asked(
     """Ask for a value until it can be read and can be.
 
     :param what: what is asked for, with its unit.
-    :param flag: the flag that would have given it.
+    :param flag: the flag that would have given it, with those of the questions that follow.
     :param known: the value that Enter takes; empty: none.
     :param example: what may be typed.
     :param read: returns the value of a text; None: it has none.

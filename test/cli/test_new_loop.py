@@ -605,13 +605,13 @@ def test_a_form_that_can_be_goes_to_relay_node_as_numbers() -> None:
     assert sent["baseline"] == 12.0
 
 
-def test_where_nobody_can_be_asked_the_flag_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_nobody_can_be_asked_the_flags_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
-    with pytest.raises(LoopError, match="give --at"):
+    with pytest.raises(LoopError, match=r"give --at, --within, --command-within$"):
         TopicLoop(Looker(), options())
-    with pytest.raises(LoopError, match="give --within"):
+    with pytest.raises(LoopError, match=r"give --within, --command-within$"):
         TopicLoop(Looker(), options("--at", "2"))
-    with pytest.raises(LoopError, match="give --command-within"):
+    with pytest.raises(LoopError, match=r"give --command-within$"):
         TopicLoop(Looker(), options("--at", "2", "--within", "1", "9"))
     with pytest.raises(LoopError, match="give --yes"):
         agrees("Start?", yes=False)
