@@ -160,11 +160,13 @@ class ExperimentParameters:
 
     def _validate_together(self) -> None:
         if self.finds_amplitude:
-            if not (math.isfinite(self.command_min) and math.isfinite(self.command_max)):
+            limits = ("command_min", "command_max")
+            lacking = [name for name in limits if not math.isfinite(getattr(self, name))]
+            if lacking:
                 raise ParameterError(
-                    f"amplitude is 0, to be found between command_min and command_max, which are "
-                    f"{self.command_min:g} and {self.command_max:g}: give both limits, or give "
-                    f"the amplitude, half the step that the process may see"
+                    "amplitude is 0, to be found within the limits of the command; "
+                    f"{' and '.join(lacking)} not given: give both limits, or the amplitude, half "
+                    "the step that the process may see"
                 )
         elif abs(self.relay_bias) >= self.amplitude:
             raise ParameterError(

@@ -35,7 +35,15 @@ def test_defaults_with_an_amplitude_are_valid():
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [
-        ({"amplitude": 0.0}, "amplitude is 0, to be found between command_min and command_max"),
+        (
+            {"amplitude": 0.0},
+            "amplitude is 0, to be found within the limits of the command; command_min and "
+            "command_max not given: give both limits, or the amplitude",
+        ),
+        (
+            {"amplitude": 0.0, "command_min": 0.0},
+            "amplitude is 0, to be found within the limits of the command; command_max not given",
+        ),
         ({"amplitude": -1.0}, "amplitude is -1, expected at least 0 u"),
         ({"amplitude": math.nan}, "amplitude is nan, expected"),
         ({"amplitude": math.inf}, "amplitude is inf, expected a finite number"),
