@@ -12,7 +12,6 @@ from pathlib import Path
 
 from relay_autotune.bag.csv_file import read_csv
 from relay_autotune.bag.signals import Selection
-from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
 from relay_autotune.cli.arguments import DONE, finite, run_command, say
 from relay_autotune.cli.jobs import add_times
 from relay_autotune.errors import BagError, SelectionError
@@ -62,6 +61,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _convert(options: argparse.Namespace) -> int:
+    # Imported here, so that --help needs no yaml.
+    from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
+
     wanted = Selection(
         options.measurement,
         options.command,

@@ -41,3 +41,10 @@ def test_a_missing_package_is_told_in_one_line(name, words, absent, told, tmp_pa
     assert len(done.stderr.splitlines()) == 1, done.stderr
     assert absent[0] in done.stderr and told in done.stderr
     assert "defect" not in done.stderr
+
+
+def test_the_help_of_csv_to_bag_needs_no_package_for_bags() -> None:
+    code = WITHOUT.format(["yaml", "mcap"], "csv_to_bag")
+    done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "--measurement-topic" in done.stdout
