@@ -347,18 +347,16 @@ class SeriesForm:
     td: float = 0.0
     alpha: float = 0.1
 
-    def isa(self, b: float = 1.0) -> Controller:
+    def isa(self) -> Controller:
         """Return the same controller in ISA form.
 
         ``kc' = kc (1 + td/ti)``, ``ti' = ti + td``, ``td' = ti td/(ti + td)``.
-
-        :param b: weight of the set-point.
         """
         tf = self.alpha * self.td
         if self.ti == 0.0:
-            return Controller(self.kc, 0.0, self.td, tf, b)
+            return Controller(self.kc, 0.0, self.td, tf)
         total = self.ti + self.td
-        return Controller(self.kc * total / self.ti, total, self.ti * self.td / total, tf, b)
+        return Controller(self.kc * total / self.ti, total, self.ti * self.td / total, tf)
 
 
 def series_form(controller: Controller) -> SeriesForm:

@@ -42,7 +42,7 @@ GENERAL = "general"
 # time constants are not smooth.
 _DAMPING_OF_A_PAIR = 1.02
 # Time constants nearer to each other than this share are equal.
-_EQUAL = 1e-9
+_EQUAL = 1e-6
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,13 @@ from relay_autotune.identification.result import Identification
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller, Gains, Performance
 from relay_autotune.loop.laws import OWN_LAW
+from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.tuning.ensemble import ensemble_ms
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.rules import PUBLISHED, Rule
-from relay_autotune.tuning.rules.formulas import describing_point_of, is_first_order
+from relay_autotune.tuning.rules.formulas import describing_point_of
 from relay_autotune.tuning.rules.step_response import two_point_fopdt
 from relay_autotune.tuning.task import DesignOptions, DesignTask, cautions, cost_of
 
@@ -85,7 +86,7 @@ def task_of_model(model: TransferFunction, options: DesignOptions | None = None)
     :param options: what is asked of the controller.
     """
     simple = None
-    if not is_first_order(model):
+    if not FOPDT.holds(model):
         try:
             simple = two_point_fopdt(model)
         except TuningError:

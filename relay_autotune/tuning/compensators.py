@@ -25,14 +25,13 @@ from dataclasses import dataclass
 
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import InternalModelLaw
+from relay_autotune.process.structures import LAG_N
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning.rules.formulas import fopdt_of, named
 from relay_autotune.tuning.task import DesignTask
 
 DEAD_TIME_LAMBDA = 2.0
 HIGH_ORDER_LAMBDA = 0.45
-
-_EQUAL = 1e-6
 
 
 @dataclass(frozen=True)
@@ -79,17 +78,13 @@ def high_order_compensator(task: DesignTask) -> Compensator:
     :raises TuningError: for any other.
     """
     model = task.process
-    lags = model.time_constants
-    equal = len(lags) >= 2 and all(
-        t.imag == 0.0 and abs(t - lags[0]) <= _EQUAL * abs(lags[0]) for t in lags
-    )
-    if not equal or model.integrators or model.zeros or lags[0].real <= 0.0:
+    if not LAG_N.holds(model):
         raise TuningError(
             "the high_order_compensator is for two or more equal lags, found "
             f"{named(task.model)}: use dead_time_compensator, or gains of a rule"
         )
-    closed, why = _lambda(task, HIGH_ORDER_LAMBDA * lags[0].real, "0.45 tau")
-    reason = f"higher-order IMC (eq 54) for {len(lags)} equal lags with lambda = {why}"
+    closed, why = _lambda(task, HIGH_ORDER_LAMBDA * model.time_constants[0].real, "0.45 tau")
+    reason = f"higher-order IMC (eq 54) for {model.order} equal lags with lambda = {why}"
     return Compensator("high_order_compensator", model, closed, reason)
 
 

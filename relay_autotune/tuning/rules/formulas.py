@@ -39,6 +39,7 @@ from relay_autotune.errors import ModelError, TuningError
 from relay_autotune.identification.limit_cycle.shape import shape_of_half_cycle
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.simulation import HalfCycle
+from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.record.record import CycleFeatures
@@ -79,12 +80,6 @@ def named(model: TransferFunction) -> str:
     return f"{kind} process of order {model.order} with {len(model.zeros)} zeros"
 
 
-def is_first_order(model: TransferFunction) -> bool:
-    """Return whether a model is one stable lag with or without dead time."""
-    lags = model.time_constants
-    return model.integrators == 0 and not model.zeros and len(lags) == 1 and lags[0].real > 0.0
-
-
 def fopdt_of(rule: str, task: DesignTask) -> Reduced:
     """Return the FOPDT process on which a rule designs: the model, or else the simple one.
 
@@ -94,13 +89,13 @@ def fopdt_of(rule: str, task: DesignTask) -> Reduced:
     """
     delay = task.options.added_delay
     model, note = task.model, ""
-    if not is_first_order(model):
+    if not FOPDT.holds(model):
         if model.grows:
             raise TuningError(
                 f"the rule {rule} is for a stable FOPDT process, found {named(model)}, which is "
                 "unstable: use robust or unstable"
             )
-        if model.integrators or task.simple is None or not is_first_order(task.simple):
+        if model.integrators or task.simple is None or not FOPDT.holds(task.simple):
             raise TuningError(
                 f"the rule {rule} is for a stable FOPDT process, found {named(model)}: use a "
                 "rule for that structure, or robust"
@@ -135,20 +130,17 @@ def own_point(rule: str, task: DesignTask) -> UltimatePoint:
     return point
 
 
-def wants_pid(rule: str, task: DesignTask, *, pi: bool = True, pid: bool = True) -> bool:
+def wants_pid(rule: str, task: DesignTask, *, pid: bool = True) -> bool:
     """Return whether the rule's PID is asked for rather than its PI.
 
     :param rule: name of the rule.
-    :param pi: whether the rule gives PI gains, which are the default.
     :param pid: whether it gives PID gains.
-    :raises TuningError: if what is asked for is not what it gives.
+    :raises TuningError: if it gives none where they are asked for.
     """
-    asked = task.options.controller
-    if asked == "pid" and not pid:
+    asked = task.options.controller == "pid"
+    if asked and not pid:
         raise TuningError(f"the rule {rule} gives no PID gains: ask for pi, or use another rule")
-    if asked == "pi" and not pi:
-        raise TuningError(f"the rule {rule} gives PID gains only: ask for pid, or use another")
-    return asked == "pid" or not pi
+    return asked
 
 
 def controller(

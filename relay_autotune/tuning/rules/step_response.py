@@ -37,13 +37,13 @@ import numpy as np
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller, SeriesForm
 from relay_autotune.process.response import response
+from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant
 from relay_autotune.scalar import root
 from relay_autotune.tuning.rules.formulas import (
     Reduced,
     controller,
-    is_first_order,
     named,
     wants_pid,
 )
@@ -71,7 +71,7 @@ def step_response(model: TransferFunction) -> Reduced:
         # The tangent in the long run begins to rise after all delays and lags.
         shift = sum(t.real for t in model.time_constants) - sum(z.real for z in model.zeros)
         return Reduced(model.gain, math.inf, model.dead_time + shift)
-    if is_first_order(model):
+    if FOPDT.holds(model):
         return Reduced(model.gain, model.time_constants[0].real, model.dead_time)
     rise = _Rise(model)
     slopes = np.gradient(rise.y, rise.time)

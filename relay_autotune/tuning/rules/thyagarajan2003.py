@@ -24,6 +24,7 @@ from relay_autotune.identification.methods.thyagarajan import (
     equal_lags_row,
 )
 from relay_autotune.loop.gains import Controller
+from relay_autotune.process.structures import FOPDT, LAG_N
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.scalar import root
 from relay_autotune.tuning.rules.formulas import (
@@ -31,7 +32,6 @@ from relay_autotune.tuning.rules.formulas import (
     fopdt_of,
     half_cycle,
     imc,
-    is_first_order,
     itae,
     named,
     tyreus_luyben,
@@ -43,7 +43,6 @@ from relay_autotune.tuning.task import DesignTask
 RESONANCE = 3.0
 MARGIN = math.radians(45.0)
 
-_EQUAL = 1e-6
 _LEAST_LAGS = 3
 
 _Designed = tuple[Controller, str]
@@ -101,15 +100,14 @@ def lcmax(task: DesignTask) -> _Designed:
     :raises TuningError: for any other.
     """
     model = task.process
-    lags = _real_lags(model)
-    n = len(lags)
-    if n < _LEAST_LAGS or max(lags) > min(lags) * (1.0 + _EQUAL):
+    n = model.order
+    if n < _LEAST_LAGS or not LAG_N.holds(model):
         raise TuningError(
             f"the rule lcmax is for {_LEAST_LAGS} or more equal lags, found {named(task.model)}: "
             "use thyagarajan, which takes the structure by the shape, or robust"
         )
     wants_pid("lcmax", task, pid=False)
-    ti = (n - 1) * lags[0]
+    ti = (n - 1) * model.time_constants[0].real
     size = math.copysign(gain(model, ti, RESONANCE), model.gain)
     return Controller(size, ti), (f"closed-loop resonance of 3 dB for {n} equal lags")
 
@@ -125,7 +123,7 @@ def thyagarajan(task: DesignTask) -> _Designed:
     :param task: a stable process with a limit cycle.
     :raises TuningError: for any other.
     """
-    if is_first_order(task.model):
+    if FOPDT.holds(task.model):
         return _table_4(task)
     model = task.process
     if not model.is_stable:
@@ -175,10 +173,9 @@ def _equivalent(
     category: str, shape: Shape, model: TransferFunction
 ) -> tuple[TransferFunction | None, Callable[[DesignTask], _Designed]]:
     """Return a model of the category, None where the task has one, and the category's rule."""
-    lags = _real_lags(model)
-    if category == "2" and len(lags) == 2:
+    if category == "2" and len(_real_lags(model)) == 2:
         return None, phase_margin
-    if category == "3" and len(lags) >= _LEAST_LAGS and max(lags) <= min(lags) * (1.0 + _EQUAL):
+    if category == "3" and model.order >= _LEAST_LAGS and LAG_N.holds(model):
         return None, lcmax
     rows = {
         "1a": (SHARP_FOPDT, _table_4),
