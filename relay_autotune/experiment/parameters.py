@@ -98,7 +98,14 @@ class ExperimentParameters:
     @property
     def relay_bias(self) -> float:
         """The offset mu0 of the middle of the levels from the baseline [u]."""
-        return self.bias if self.bias != 0.0 else self.bias_ratio * self.amplitude
+        return self.bias_at(self.amplitude)
+
+    def bias_at(self, amplitude: float) -> float:
+        """Return that offset at an amplitude [u].
+
+        :param amplitude: of the relay [u].
+        """
+        return self.bias or self.bias_ratio * amplitude
 
     @property
     def finds_amplitude(self) -> bool:
@@ -135,7 +142,7 @@ class ExperimentParameters:
         :param baseline: command of the operating point [u].
         """
         first = self.first_amplitude if self.finds_amplitude else 0.0
-        bias = self.bias or self.bias_ratio * first
+        bias = self.bias_at(first)
         for name, limit, room, step in (
             ("command_min", self.command_min, baseline - self.command_min, first - bias),
             ("command_max", self.command_max, self.command_max - baseline, first + bias),

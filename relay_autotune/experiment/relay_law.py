@@ -219,7 +219,7 @@ class Levels:
     def _set(self) -> None:
         p = self._parameters
         if p.finds_amplitude:
-            bias = p.bias if p.bias != 0.0 else p.bias_ratio * self._wanted
+            bias = p.bias_at(self._wanted)
         else:
             bias = p.relay_bias * (self._wanted / p.amplitude)
         middle = self._baseline + bias + self._shift
