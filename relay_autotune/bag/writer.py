@@ -232,16 +232,13 @@ class BagWriter:
         """The MCAP file."""
         return self.path / self._file_name
 
-    def write(
-        self, topic: str, log_time_ns: int, publish_time_ns: int, cdr: bytes, sequence: int = 0
-    ) -> None:
+    def write(self, topic: str, log_time_ns: int, publish_time_ns: int, cdr: bytes) -> None:
         """Add a message to the recording; it is safe after the next `flush`.
 
         :param topic: name of one of the topics given at the start.
         :param log_time_ns: when it arrived or left here [ns since the epoch].
         :param publish_time_ns: when its publisher sent it [ns since the epoch].
         :param cdr: the message, serialized with the 4 bytes of its encapsulation.
-        :param sequence: number that its publisher gave it; 0: none.
         :raises BagError: if the file system refused this or an earlier write, the topic is
             unknown, or the bag is closed.
         """
@@ -252,7 +249,7 @@ class BagWriter:
                 f"which has {', '.join(self._channels) or 'none'}"
             )
         self._writer.add_message(
-            self._channels[topic], int(log_time_ns), cdr, int(publish_time_ns), sequence
+            self._channels[topic], int(log_time_ns), cdr, int(publish_time_ns)
         )
         self._counts[topic] += 1
         first = log_time_ns if self._first_ns is None else self._first_ns

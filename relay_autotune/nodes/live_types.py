@@ -30,6 +30,7 @@ from relay_autotune.bag.field_path import (
     steps_of,
 )
 from relay_autotune.errors import FieldError, ParameterError
+from relay_autotune.exchange.messages import set_stamp, stamp_nanoseconds
 
 # Sequences that a message must have of the same length, or its consumer reads beyond an end.
 _ALIKE = {"control_msgs/msg/MultiDOFCommand": ("dof_names", "values", "values_dot")}
@@ -66,10 +67,8 @@ def reader_of(type_name: str, field: str, parameter: str = "measurement_field") 
         steps = steps_of(struct_of(kind), field, type_name)
     except FieldError as error:
         raise ParameterError(f"{parameter}: {error}") from None
-    example = kind()
-    is_plain = steps == ("data",) and isinstance(example.data, float)
-    stamp = _header_stamp if hasattr(example, "header") else None
-    return Reader(kind, type_name, _data if is_plain else reading(steps), stamp)
+    stamp = _header_stamp if hasattr(kind(), "header") else None
+    return Reader(kind, type_name, reading(steps), stamp)
 
 
 def message_class(type_name: str, parameter: str) -> Any:
@@ -114,13 +113,8 @@ def _type_of(slot: Any) -> Type:
     return number_named(_PLAIN.get(slot.typename, slot.typename))
 
 
-def _data(message: Any) -> float:
-    return message.data
-
-
 def _header_stamp(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    return stamp_nanoseconds(message.header.stamp)
 
 
 class CommandMessage:
@@ -169,8 +163,6 @@ class CommandMessage:
         self.value: Callable[[Any], float] = reading(steps)
         """Returns the command in a message [u]; raises `FieldError` if it does not tell it."""
         self._put = setting(steps)
-        if steps == ("data",):
-            self._put = _set_data
         self._beside = "what other_commands says" if taken else given or "zeros"
         self._stamped = hasattr(message, "header")
         self._now_ns = now_ns
@@ -196,8 +188,7 @@ class CommandMessage:
             return None
         self._put(message, command)
         if self._stamped:
-            stamp = message.header.stamp
-            stamp.sec, stamp.nanosec = divmod(self._now_ns(), 1_000_000_000)
+            set_stamp(message.header.stamp, self._now_ns())
         return message
 
     def on_wire(self, command: float) -> float:
@@ -244,10 +235,6 @@ class CommandMessage:
         if len({len(getattr(message, name)) for name in alike}) > 1:
             found = ", ".join(f"{len(getattr(message, name))} {name}" for name in alike)
             raise FieldError(f"expected as many of {', '.join(alike)}; found {found}")
-
-
-def _set_data(message: Any, command: float) -> None:
-    message.data = command
 
 
 def _number_of(root: Struct, steps: tuple[Step, ...]) -> Number:
