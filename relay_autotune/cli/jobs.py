@@ -272,25 +272,38 @@ def died(job: Job, how: str) -> Done:
     return _failed(job, (), f"{job.name}: {how}", NOTHING_FOUND)
 
 
-def add_design(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say what is asked of a controller.
+# What of a design most users ask for.
+_ASKED = ("controller", "ms", "sample_period", "law")
+
+
+def add_design(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """Add the options that say what is asked of a controller, those that most users need.
 
     :param parser: of the command.
+    :return: the group that they are in.
     """
     group = parser.add_argument_group("what is asked of the controller")
     kind = group.add_mutually_exclusive_group()
     kind.add_argument(
-        "--controller", choices=CONTROLLERS, help="auto is PI unless the rule finds PID worth it"
-    )
+        "--controller", choices=CONTROLLERS, metavar="KIND",
+        help="auto, pi or pid; auto is PI unless the rule finds PID worth it",
+    )  # fmt: skip
     for each in ("pi", "pid"):
         kind.add_argument(
-            f"--{each}",
-            dest="controller",
-            action="store_const",
-            const=each,
+            f"--{each}", dest="controller", action="store_const", const=each,
             help=f"the same as --controller {each}",
-        )
-    add_quantities(group, (each for each in declared(DesignOptions) if each.name != "controller"))
+        )  # fmt: skip
+    add_quantities(group, (each for each in declared(DesignOptions) if each.name in _ASKED[1:]))
+    return group
+
+
+def add_design_details(parser: argparse.ArgumentParser) -> None:
+    """Add the others of these options.
+
+    :param parser: of the command.
+    """
+    group = parser.add_argument_group("more on the design")
+    add_quantities(group, (each for each in declared(DesignOptions) if each.name not in _ASKED))
 
 
 def design_options(options: argparse.Namespace) -> DesignOptions:
@@ -321,8 +334,8 @@ def add_export(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     group.add_argument(
         "--export",
         metavar="LAW",
-        help="print a file that other programs load instead: yaml, or of a law of --law, which "
-        "needs not be named again",
+        help="print the gains for a program instead: a law of --law, which needs not be named "
+        "again, yaml or launch",
     )
     group.add_argument(
         "--node", default="/pid_controller", metavar="NAME", help="whose file it is (%(default)s)"
@@ -348,63 +361,69 @@ def export_target(options: argparse.Namespace) -> Target:
 
 
 def add_analysis(parser: argparse.ArgumentParser) -> None:
-    """Add options: what is taken from a recording, how it is identified and tuned.
+    """Add options: what is taken from a recording, and what is asked, as most users need them.
 
     :param parser: of the command.
     """
     taken = parser.add_argument_group("what is taken from a recording")
     for signal in ("measurement", "command"):
         taken.add_argument(
-            f"--{signal}",
-            metavar="TOPIC[:FIELD]",
-            help=f"topic, or column of a CSV, of the {signal}",
-        )
-    add_times(taken)
-    taken.add_argument(
-        "--start", type=finite, metavar="S", help="leave out what is before S [s from the start]"
-    )
-    taken.add_argument(
-        "--end", type=finite, metavar="S", help="leave out what is after S [s from the start]"
-    )
-    taken.add_argument(
-        "--command-before", type=finite, metavar="U",
-        help="command that held before the recording, where that begins with its step",
-    )  # fmt: skip
-    taken.add_argument(
-        "--clock", choices=CLOCKS, default=CLOCKS[0],
-        help="time of a message: when it was published, when it was recorded, or its header's "
-        "stamp (%(default)s)",
-    )  # fmt: skip
-    taken.add_argument(
-        "--join", action="store_true", help="take all BAGs as one recording on one timeline"
-    )
+            f"--{signal}", metavar="NAME",
+            help=f"of the {signal}: TOPIC, TOPIC:FIELD, or the column of a CSV",
+        )  # fmt: skip
+    for end, what in (("start", "before"), ("end", "after")):
+        taken.add_argument(
+            f"--{end}", type=finite, metavar="S",
+            help=f"leave out what is {what} S [s from the start]",
+        )  # fmt: skip
     taken.add_argument(
         "--joint", action="append", default=[], metavar="NAME",
         help="find measurement and command of this joint by its name; of several, one after the "
         "other",
     )  # fmt: skip
     taken.add_argument(
-        "--joint-order", metavar="NAME,NAME,...",
-        help="joints of commands that do not name them, as in the controller's parameter joints",
-    )  # fmt: skip
-    taken.add_argument(
         "--jointly", action="store_true",
         help="take all experiments as tests of one process, with one model",
+    )  # fmt: skip
+    add_design(parser).add_argument(
+        "--present", nargs=3, type=finite, metavar=("KC", "TI", "TD"),
+        help="gains in the controller now, to see them beside the new ones [u/y, s, s]; TI 0: P",
+    )  # fmt: skip
+
+
+def add_details(parser: argparse.ArgumentParser) -> None:
+    """Add the others of the options of :func:`add_analysis`, which fewer users need.
+
+    :param parser: of the command.
+    """
+    taken = parser.add_argument_group("recordings that need more")
+    add_times(taken)
+    taken.add_argument(
+        "--command-before", type=finite, metavar="U",
+        help="command that held before the recording, where that begins with its step",
+    )  # fmt: skip
+    taken.add_argument(
+        "--clock", choices=CLOCKS, default=CLOCKS[0], metavar="TIME",
+        help="time of a message: publish, record, or header, the stamp in it (%(default)s)",
+    )  # fmt: skip
+    taken.add_argument(
+        "--join", action="store_true", help="take all BAGs as one recording on one timeline"
+    )
+    taken.add_argument(
+        "--joint-order", metavar="NAMES",
+        help="joints, with commas, of commands that do not name them, as in the controller's "
+        "parameter joints",
     )  # fmt: skip
     taken.add_argument(
         "--max-chunk", dest="largest_chunk", type=_size, metavar="SIZE", default=LARGEST_CHUNK,
         help="leave out chunks that declare more than SIZE, such as 64M or 2G "
         f"({LARGEST_CHUNK >> 20}M)",
     )  # fmt: skip
-    how = parser.add_argument_group("identification and design")
+    how = parser.add_argument_group("how the process is identified, and the rule of the gains")
     how.add_argument("--method", default="waveform", help="how to identify (%(default)s)")
     add_quantities(how, declared(Known))
     how.add_argument("--rule", default="robust", help="how to tune (%(default)s)")
-    add_design(parser)
-    parser.add_argument(
-        "--present", nargs=3, type=finite, metavar=("KC", "TI", "TD"),
-        help="gains in the controller now, to see them beside the new ones [u/y, s, s]; TI 0: P",
-    )  # fmt: skip
+    add_design_details(parser)
 
 
 def present_of(options: argparse.Namespace, loops: Collection[str]) -> Controller | None:
@@ -434,8 +453,9 @@ def add_times(parser: argparse._ActionsContainer) -> None:
     """
     parser.add_argument("--time", metavar="NAME", help="column of the time of a CSV")
     parser.add_argument(
-        "--time-unit", choices=TIME_UNITS, help="its unit, where the CSV does not say it (s)"
-    )
+        "--time-unit", choices=TIME_UNITS, metavar="UNIT",
+        help=f"its unit, where the CSV does not say it: {', '.join(TIME_UNITS)} (s)",
+    )  # fmt: skip
     parser.add_argument(
         "--period", type=finite, metavar="S", help="time from row to row of a CSV without times"
     )

@@ -25,6 +25,7 @@ from relay_autotune.cli.jobs import (
     Done,
     Job,
     add_analysis,
+    add_details,
     add_export,
     export_target,
     jobs_of,
@@ -54,9 +55,8 @@ _EPILOG = """\
 A BAG is a rosbag2 directory, an .mcap file, or a table of text such as a .csv.
 Topics need not be named if the bag holds experiments of relay_node, or one pair
 of topics, each of a single number, that looks like measurement and command.
-Of several BAGs, those that are no recording are passed over, with a line each.
-Of a folder of recordings a table is printed as they are done, a line for each
-experiment.
+Others among several BAGs are passed over, with a line each. Of a folder of
+recordings a table is printed as they are done, a line for each experiment.
 
 Results go to standard output, everything else to standard error.
 Exit status: 0 every bag gave gains; 1 at least one gave none; 2 the command
@@ -65,18 +65,14 @@ experiment are doubtful.
 
 Examples, with the recordings that come with the package:
   replay bags/biased_relay
-  replay --jobs 2 bags
   replay bags/heater.csv --measurement 'Temperature 1' --command 'Heater 1'
-  replay --json --start 10 --rule simc bags/step_test
-  replay --jobs 2 --output fleet.csv bags/*
   replay --ms 1.6 --export pid_controller --dof heater bags/step_test > g.yaml
   replay --web bags/step_test
-  replay --method chang --gain 1.65 bags/unbiased_relay_with_noise
+  replay --jobs 2 --output fleet.csv bags/*
   replay --jointly bags/biased_relay bags/unbiased_relay_with_noise
 And with some of your own:
   replay --measurement /imu:angular_velocity.z --command /wheel/volt robot_bag
   replay --joint left_wheel --joint right_wheel --output wheels.csv robot_bag
-  replay --method li without_extra_delay with_extra_delay
 """
 
 
@@ -95,35 +91,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
+        usage="%(prog)s [options] BAG [BAG ...]",
         description="Identify the process in recordings, and tune a controller for it.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("bags", nargs="+", metavar="BAG", help="recordings")
     add_analysis(parser)
-    parser.add_argument(
-        "--form", choices=FORMS, default=FORMS[0],
-        help="form in which gains are shown, too; ISA and parallel form always are",
-    )  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="print one JSON document a bag")
-    parser.add_argument(
+    out = parser.add_argument_group("what comes out")
+    out.add_argument("--json", action="store_true", help="print one JSON document a bag")
+    out.add_argument(
         "--report", metavar="FILE", help="also write a report: .html, or a .png, .svg or .pdf"
     )
-    parser.add_argument(
+    out.add_argument(
         "-o", "--output", metavar="FILE",
         help="write results as they come to a .jsonl, .csv or .parquet file instead; "
         "bags that it already has are left out; with --export the file of the gains",
     )  # fmt: skip
-    parser.add_argument(
-        "--jobs", type=_count, metavar="N", default=1, help="bags at a time (%(default)s)"
-    )
-    parser.add_argument(
-        "--scheduler", metavar="ADDRESS", help="work on a Dask cluster, such as tcp://host:8786"
-    )
+    out.add_argument(
+        "--form", choices=FORMS, default=FORMS[0], metavar="FORM",
+        help="form in which gains are shown, too: series; ISA and parallel form always are",
+    )  # fmt: skip
     add_export(parser).add_argument(
         "--accept-doubtful", action="store_true", help="also write gains that are doubtful"
     )
     add_web(parser)
+    add_details(parser)
+    many = parser.add_argument_group("many bags")
+    many.add_argument(
+        "--jobs", type=_count, metavar="N", default=1, help="bags at a time (%(default)s)"
+    )
+    many.add_argument(
+        "--scheduler", metavar="ADDRESS", help="work on a Dask cluster, such as tcp://host:8786"
+    )
     return parser
 
 

@@ -30,7 +30,7 @@ from relay_autotune.cli.arguments import (
     typed_as,
     worst,
 )
-from relay_autotune.cli.jobs import Job, add_analysis, analysed, jobs_of, present_of
+from relay_autotune.cli.jobs import Job, add_analysis, add_details, analysed, jobs_of, present_of
 from relay_autotune.cli.terminal import Working
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
 from relay_autotune.report import PICTURES, is_ours, write_figures, write_page, write_picture
@@ -88,6 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--title", metavar="TEXT", default="", help="title of the report")
     add_analysis(parser)
+    add_details(parser)
     return parser
 
 

@@ -29,7 +29,14 @@ from relay_autotune.cli.arguments import (
     say,
     with_negative,
 )
-from relay_autotune.cli.jobs import add_design, add_export, design_options, export_target, show
+from relay_autotune.cli.jobs import (
+    add_design,
+    add_design_details,
+    add_export,
+    design_options,
+    export_target,
+    show,
+)
 from relay_autotune.cli.table import gains_lines
 from relay_autotune.cli.terminal import in_columns, labelled, width, write
 from relay_autotune.errors import ModelError, SelectionError, TuningError
@@ -492,6 +499,7 @@ def _parser() -> argparse.ArgumentParser:
         "--output", metavar="FILE", help="write the file there, not to standard output"
     )
     add_web(parser)
+    add_design_details(parser)
     return parser
 
 

@@ -233,7 +233,7 @@ def test_the_table_has_the_present_gains_beside_the_new_ones(
     )
     assert "the new gains are " in told
     # A file of gains on standard output leaves the comparison to standard error.
-    assert replay.main([logs[0], *present, "--export", "pid_controller"]) == 0
+    assert replay.main([logs[0], *present, "--export", "controller_node"]) == 0
     file, beside = capsys.readouterr()
     assert row in [line.split() for line in beside.splitlines()] and "  Ms  " not in file
     assert replay.main([*logs, *present]) == 2

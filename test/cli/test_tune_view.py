@@ -20,7 +20,7 @@ from report_cases import only
 from relay_autotune.analysis import PARAMETERS, Task, known_from, options_from
 from relay_autotune.cli import tune_loop
 from relay_autotune.cli.after_tune import AfterTune
-from relay_autotune.cli.jobs import add_analysis, jobs_of
+from relay_autotune.cli.jobs import add_analysis, add_details, jobs_of
 from relay_autotune.cli.report import flags_of
 from relay_autotune.cli.tune_view import (
     OUTCOMES,
@@ -286,6 +286,7 @@ def test_the_flags_of_the_next_command_give_what_the_identifier_was_asked_for() 
     values = DEFAULTS | told
     parser = ArgumentParser()
     add_analysis(parser)
+    add_details(parser)
     (job,) = jobs_of(parser.parse_args(shlex.split(flags_of(values))), ["bag"])
     assert job.task == Task("chang", "imc", known_from(values), options_from(values))
 
