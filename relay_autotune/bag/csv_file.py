@@ -431,10 +431,13 @@ def _choose(
         ]
     if len(pair) < 2:
         least = (
-            "; expected time, measurement and command, or two columns and their sampling "
-            "period with --period S"
+            "; expected time, measurement and command in each row (put blocks of single signals "
+            "side by side), or two columns and their sampling period with --period S"
         )
-        if len(names) >= 3:
+        if len(set(names)) < len(names):
+            choices = []
+            least = "; expected a name of its own for each, in the line just above the numbers"
+        elif len(names) >= 3:
             other = "" if time is None else f", and --time NAME if it is not {names[time]!r}"
             least = f"; name two of them with --measurement NAME --command NAME{other}, such as"
         raise SelectionError(

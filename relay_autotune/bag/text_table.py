@@ -36,6 +36,8 @@ _REMARKS = ("#", "%", "//")
 _FIRST = 64 << 10
 # Largest number of lines before the rows of numbers.
 _LONGEST_HEAD = 1000
+# Characters of a line that are shown.
+_SHOWN = 60
 # Largest share of rows with text in place of a number that are left out; more are a fault.
 _DAMAGED = 0.02
 _COMMAS = (
@@ -154,9 +156,12 @@ class TextTable:
         fits = [self._is_header(cells, filled) for _, cells in above]
         if not fits or not fits[-1]:
             if not width:
+                line, cells = rows[-1]
+                found = visible(self._separator.join(cells))
                 raise BagError(
-                    f"{self._path} has 0 rows of numbers; expected columns of time, measurement "
-                    "and command, separated by commas, semicolons, tabs or spaces"
+                    f"{self._path} has 0 rows of numbers; line {line} is {found[:_SHOWN]!r}; "
+                    "expected columns of time, measurement and command, separated by commas, "
+                    "semicolons, tabs or spaces: write the numbers of such lines into columns"
                 )
             names = [str(number) for number in range(1, width + 1)]
             why = "there is no header line"
@@ -260,7 +265,7 @@ class TextTable:
             raise damaged[0]
         self._settle_order(times)
         if len(lines) < 2:
-            raise BagError(f"{self._path} has {len(lines)} rows of numbers; expected at least two")
+            raise BagError(f"{self._path} has fewer than two rows of numbers; expected more")
         for count, what in ((len(times.dates), "dates"), (len(times.clock), "times of day")):
             if time is not None and 0 < count < len(lines):
                 raise BagError(

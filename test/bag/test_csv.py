@@ -152,8 +152,16 @@ def test_dates_in_seconds_become_the_start(tmp_path):
     [
         ("", "is empty; expected a header line"),
         ("\n\n", "is empty; expected a header line"),
-        ("t y u\n0 1 2\n", "has 1 rows of numbers; expected at least two"),
+        ("t y u\n0 1 2\n", "has fewer than two rows of numbers; expected more"),
         ("t,y\n0,1\n1,2\n", r"2 columns: 't', 'y'; expected time, measurement and command"),
+        # A trace of a PLC with a block for each signal, and one with a pair of columns for each.
+        ("PLC.fTemp\n0;20\n1;21\n\nPLC.fOut\n0;5\n1;50\n", "put blocks of single signals side by"),
+        ("Type,REAL,Type,REAL\n0,1,0,2\n1,2,1,3\n", "a name of its own for each"),
+        # The log of a printer, whose numbers stand between words.
+        (
+            "Starting Klippy...\nStats 9.1: gcodein=0 heater_bed: target=60 temp=21.5 pwm=0.000\n",
+            r"line 2 is 'Stats 9\.1: .*: write the numbers of such lines into columns",
+        ),
         ("y,u,v\n1,1,2\n2,2,3\n2,3,3\n1,3,3\n1,3,4\n", "'y' does not rise.*--period S"),
         ("t,setpoint,y\n0,1,2\n1,2,3\n", "'setpoint' seems to be a set-point"),
         ("stamp,y,u\n0,1,2\n10000,2,3\n", "steps by 10000 from row to row.*--time-unit s|ms"),
@@ -161,7 +169,7 @@ def test_dates_in_seconds_become_the_start(tmp_path):
         ("t;y;u\n0;1.000,5;2\n1;2;2\n", r"line 2: 'y' is '1.000,5'; expected a number"),
         ("t,y,u\n0,1,2\n2026-01-01T00:00:00,2,1\n", "of 2 cells of 't' 1 are dates"),
         ("t,y,u\n" + "0" * (1 << 20) + ",1,2\n", "a line of more than 1048576 characters"),
-        ("t,y,u\n", "has 0 rows of numbers"),
+        ("t,y,u\n", "has fewer than two rows of numbers"),
         ("t,y,u\n0,1,2\n1,inf,2\n", r"line 3: 'y' is inf; expected a finite number"),
         ("t,y,u\n0,1,2\n1,3,-inf\n", r"line 3: 'u' is -inf; expected a finite"),
         ("t,y,u\n0,1,2\n1,3 V,2\n", r"line 3: 'y' is '3 V'; expected a number"),
