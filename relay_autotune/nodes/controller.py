@@ -43,11 +43,11 @@ from relay_autotune.nodes.gains_place import (
     RemoteLoop,
     controller_text,
     mapping_of,
-    reported_by,
+    setpoint_message,
 )
 from relay_autotune.nodes.goals import serve
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
-from relay_autotune.nodes.live_types import reader_of
+from relay_autotune.nodes.live_types import command_reader, reader_of
 from relay_autotune.nodes.parameters import ask_before_changes, declare, merged, values_of
 from relay_autotune.nodes.results import ResultCheck, why_doubtful
 from relay_autotune.nodes.verifier import Predictors, Verifiable, Verifier
@@ -165,7 +165,7 @@ class ControllerNode(ServedNode):
         )
         self._remote: RemoteLoop | None = None
         self._place: Place = OwnGains(self._use, self._rate)
-        self._reported, setpoints = reported_by(values)
+        setpoints, self._reported = setpoint_message(values), command_reader(values)
         if values["apply_to"]:
             target, mapping = values["apply_to"], mapping_of(values["apply_parameters"])
             self._place = RemoteGains(self, target, mapping, values["apply_feedforward"])

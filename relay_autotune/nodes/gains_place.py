@@ -28,7 +28,7 @@ from relay_autotune.loop.law import LawRate
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY
-from relay_autotune.nodes.live_types import CommandMessage, reader_of
+from relay_autotune.nodes.live_types import CommandMessage
 from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.nodes.tables import (
     GAINS,
@@ -328,18 +328,15 @@ tells which are in force. All but the last raise RelayAutotuneError.
 _SILENCE = 2.0
 
 
-def reported_by(values: Mapping[str, Any]) -> tuple[Callable[[Any], float] | None, CommandMessage]:
-    """Return what reads the other node's command from the measurement's messages, and set-points.
+def setpoint_message(values: Mapping[str, Any]) -> CommandMessage:
+    """Return what writes a set-point into the message that its receiver takes.
 
     :param values: the parameters of controller_node.
-    :return: the reader, None: these messages do not have it; what writes a set-point.
-    :raises ParameterError: if they cannot have it, or nothing is done with a parameter.
+    :raises ParameterError: if nothing is done with a parameter.
     """
     field, target = values["controller_command_field"], values["apply_to"]
     if field and target:
-        message = (values[each.name] for each in MESSAGE_PARAMETERS)
-        read = reader_of(values["measurement_type"], field, "controller_command_field").value
-        return read, CommandMessage(*message)
+        return CommandMessage(*(values[each.name] for each in MESSAGE_PARAMETERS))
     said = [each.name for each in MESSAGE_PARAMETERS if values[each.name] != each.default]
     if field or said:
         raise ParameterError(
@@ -347,7 +344,7 @@ def reported_by(values: Mapping[str, Any]) -> tuple[Callable[[Any], float] | Non
             f"together with controller_command_field: the set-point of another node in a message "
             f"of its own"
         )
-    return None, CommandMessage()
+    return CommandMessage()
 
 
 class RemoteLoop:

@@ -71,6 +71,19 @@ def reader_of(type_name: str, field: str, parameter: str = "measurement_field") 
     return Reader(kind, type_name, reading(steps), stamp)
 
 
+def command_reader(values: Mapping[str, Any]) -> Callable[[Any], float] | None:
+    """Return what reads the controller's command from the measurement's messages.
+
+    :param values: the parameters of relay_node or controller_node.
+    :return: None: these messages do not have it.
+    :raises ParameterError: if they cannot have it.
+    """
+    field = values["controller_command_field"]
+    if not field:
+        return None
+    return reader_of(values["measurement_type"], field, "controller_command_field").value
+
+
 def message_class(type_name: str, parameter: str) -> Any:
     """Return the class of a message type.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -17,20 +17,20 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from std_srvs.srv import Trigger
 
-from relay_autotune.errors import FieldError, NotReadyError
+from relay_autotune.errors import FieldError, NotReadyError, ParameterError
 from relay_autotune.exchange.messages import finding_from_message, set_stamp
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.nodes.goals import Narrator, TuneAction, refused, serve
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
-from relay_autotune.nodes.live_types import reader_of
+from relay_autotune.nodes.live_types import command_reader, reader_of
 from relay_autotune.nodes.loop_ends import LoopSupervisor, RelayTopics
 from relay_autotune.nodes.parameters import ask_before_changes, declare, values_of
 from relay_autotune.nodes.quality import NO_REPEAT_AFTER, why_unconnected
 from relay_autotune.nodes.readiness import Checklist, Readiness, Ready, answer_of, require_settable
 from relay_autotune.nodes.recording import Recordings
 from relay_autotune.nodes.results import MODEL, OwnResults, said_by
-from relay_autotune.nodes.session import Session, SetpointSession, reported_by
+from relay_autotune.nodes.session import Session, SetpointSession
 from relay_autotune.nodes.tables import FIXED_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.nodes.watch import Arrival, Sensor
 from relay_autotune.reasons import Code, Reason
@@ -68,7 +68,8 @@ class RelayNode(ServedNode):
         self._alarm = ""
         self._reader = reader_of(fixed["measurement_type"], fixed["measurement_field"])
         self._value = self._reader.value
-        self._reported = reported_by(fixed)
+        require_reported(fixed)
+        self._reported = command_reader(fixed)
         self._ends = RelayTopics(
             self,
             fixed,
@@ -445,6 +446,16 @@ class RelayNode(ServedNode):
         message = DiagnosticArray(status=[status])
         set_stamp(message.header.stamp, self._now_ns())
         self._ends.diagnostics.publish(message)
+
+
+def require_reported(values: Mapping[str, Any]) -> None:
+    """Refuse a command beside the measurement with which nothing would be done."""
+    field = values["controller_command_field"]
+    if field and (values["relay_on"], values["path"]) != ("setpoint", "passthrough"):
+        raise ParameterError(
+            f"controller_command_field is {field!r}, which is for relay_on setpoint with path "
+            f"passthrough: found {values['relay_on']} and {values['path']}"
+        )
 
 
 def _text(value: object) -> str:

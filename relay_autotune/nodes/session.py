@@ -8,7 +8,7 @@ from __future__ import annotations
 import array
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 import numpy.ma
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.errors import ParameterError, RecordError
+from relay_autotune.errors import RecordError
 from relay_autotune.exchange.messages import (
     fill_cycle,
     fill_experiment,
@@ -31,7 +31,6 @@ from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.faults import ClockWatch
 from relay_autotune.experiment.phases import State
-from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.quality import QUIET_AFTER_GO
 from relay_autotune.nodes.recording import Recording, Sample
 from relay_autotune.record.record import Record, RelaySettings
@@ -283,24 +282,6 @@ class Session:
 
 
 # A relay experiment on the set-point: the present loop stays closed.
-
-
-def reported_by(values: Mapping[str, Any]) -> Callable[[Any], float] | None:
-    """Return what reads the controller's command from the measurement's messages.
-
-    :param values: the fixed parameters of relay_node.
-    :return: None: these messages do not have it.
-    :raises ParameterError: if they cannot have it, or nothing is done with it.
-    """
-    field = values["controller_command_field"]
-    if not field:
-        return None
-    if values["relay_on"] != "setpoint" or values["path"] != "passthrough":
-        raise ParameterError(
-            f"controller_command_field is {field!r}, which is for relay_on setpoint with path "
-            f"passthrough: found {values['relay_on']} and {values['path']}"
-        )
-    return reader_of(values["measurement_type"], field, "controller_command_field").value
 
 
 class SetpointSession(Session):

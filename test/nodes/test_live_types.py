@@ -12,14 +12,14 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
 from sensor_msgs.msg import BatteryState, JointState
-from std_msgs.msg import Byte
+from std_msgs.msg import Byte, Float64
 
 from relay_autotune.bag.definitions import find_definition, message_type
 from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.errors import FieldError, ParameterError
 from relay_autotune.nodes import gains_place
-from relay_autotune.nodes.live_types import reader_of, struct_of
-from relay_autotune.nodes.session import reported_by
+from relay_autotune.nodes.live_types import command_reader, reader_of, struct_of
+from relay_autotune.nodes.relay import require_reported
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS
 
 JOINTS = [f"arm_{k}" for k in range(7)]
@@ -113,11 +113,12 @@ def test_a_controller_that_cannot_report_its_command_is_refused(
         "relay_on": "setpoint",
         "path": "passthrough",
     }
-    read = reported_by(values)
+    read = command_reader(values)
     assert read is not None
     assert read(JointState(name=["arm", "left"], effort=[1.0, 2.0])) == 2.0
     with pytest.raises(ParameterError, match=sentence):
-        reported_by(values | given)
+        require_reported(values | given)
+        command_reader(values | given)
 
 
 @pytest.mark.parametrize(
@@ -131,6 +132,6 @@ def test_parameters_of_another_nodes_set_point_need_that_node(
     given: dict[str, str], sentence: str
 ) -> None:
     defaults = {each.name: each.default for each in CONTROLLER_PARAMETERS}
-    assert gains_place.reported_by(defaults)[0] is None
+    assert gains_place.setpoint_message(defaults).kind is Float64
     with pytest.raises(ParameterError, match=sentence):
-        gains_place.reported_by(defaults | given)
+        gains_place.setpoint_message(defaults | given)
