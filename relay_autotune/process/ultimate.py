@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -178,7 +179,14 @@ class UltimatePoint:
 
 
 @dataclass(frozen=True)
-class _Crossing:
+class Crossing:
+    """Closed-loop poles cross the imaginary axis as the gain grows.
+
+    :param gain: at which they do, its size.
+    :param frequency: rad/s.
+    :param roots_to_the_right: how many move to the right; negative: to the left.
+    """
+
     gain: float
     frequency: float
     roots_to_the_right: int
@@ -201,17 +209,41 @@ def ultimate_point(model: TransferFunction) -> UltimatePoint | None:
 
     :param model: the process.
     """
-    crossings = sorted(_crossings(model), key=lambda c: c.gain)
+    found = first_stable(model, _crossings(model))
+    end = None if found is None else found[1]
+    if end is None or end.frequency == 0.0:
+        return None
+    return UltimatePoint(model.process_sign * end.gain, end.frequency)
+
+
+def first_stable(
+    model: TransferFunction, crossings: Iterable[Crossing], lead: float = 0.0
+) -> tuple[float, Crossing | None] | None:
+    """Return the first range of gains that stabilises a process in a loop; None: none does.
+
+    :param model: the process.
+    :param crossings: of the imaginary axis at frequencies above zero.
+    :param lead: what the controller adds to the phase near zero frequency [s].
+    :return: the least gain, and the crossing that ends the range; None: it does not end.
+    """
+    every = [*crossings]
+    if model.integrators == 0 and model.gain * model.process_sign < 0.0:
+        slope = (
+            sum(z.real for z in model.zeros)
+            - sum(t.real for t in model.time_constants)
+            - model.dead_time
+        )
+        # Near s = 0 the root is eps/(K G'(0)), and G(0) is negative.
+        every.append(Crossing(1.0 / abs(model.gain), 0.0, -1 if slope + lead > 0.0 else 1))
     on_the_right = unstable_at_small_gain(model)
-    was_stable = on_the_right == 0
-    for crossing in crossings:
+    low = 0.0 if on_the_right == 0 else math.nan
+    for crossing in sorted(every, key=lambda c: c.gain):
         on_the_right += crossing.roots_to_the_right
-        if was_stable and on_the_right > 0:
-            if crossing.frequency == 0.0:
-                return None
-            return UltimatePoint(model.process_sign * crossing.gain, crossing.frequency)
-        was_stable = was_stable or on_the_right == 0
-    return None
+        if math.isnan(low) and on_the_right == 0:
+            low = crossing.gain
+        elif not math.isnan(low) and on_the_right > 0:
+            return low, crossing
+    return None if math.isnan(low) else (low, None)
 
 
 def unstable_at_small_gain(model: TransferFunction) -> int:
@@ -234,21 +266,12 @@ def unstable_at_small_gain(model: TransferFunction) -> int:
     return unstable
 
 
-def _crossings(model: TransferFunction) -> list[_Crossing]:
+def _crossings(model: TransferFunction) -> list[Crossing]:
     """Crossings up to the first, and later ones of at least its magnitude."""
-    found = []
-    if model.integrators == 0 and model.gain * model.process_sign < 0.0:
-        slope = (
-            sum(z.real for z in model.zeros)
-            - sum(t.real for t in model.time_constants)
-            - model.dead_time
-        )
-        # Near s = 0 the root is eps/(K G'(0)), and G(0) is negative.
-        found.append(_Crossing(1.0 / abs(model.gain), 0.0, -1 if slope > 0.0 else 1))
     polar = Polar.of(model)
     logarithms = _logarithmic(polar)
     first = _scan(polar, _grid(polar, logarithms, *_first_range(polar, logarithms)))
-    found += first
+    found = [*first]
     if not first or not polar.delayed:
         return found
     last = math.log(first[-1].frequency)
@@ -327,7 +350,7 @@ def _step(angle: float) -> float:
     return max(_TURN, 1e-12 * angle)
 
 
-def _scan(polar: Polar, grid: FloatArray) -> list[_Crossing]:
+def _scan(polar: Polar, grid: FloatArray) -> list[Crossing]:
     """Return the crossings between the points of a grid of log frequencies."""
     level = np.floor(polar.turns(grid))
     cells = np.flatnonzero(np.diff(level) != 0.0)
@@ -341,7 +364,7 @@ def _scan(polar: Polar, grid: FloatArray) -> list[_Crossing]:
         frequency, gain = np.exp(place), np.exp(-polar.size(place))
     usable = np.isfinite(frequency) & np.isfinite(gain) & (frequency > 0.0) & (gain > 0.0)
     return [
-        _Crossing(float(g), float(w), 2 if fall else -2)
+        Crossing(float(g), float(w), 2 if fall else -2)
         for g, w, fall, good in zip(gain, frequency, falls, usable, strict=True)
         if good
     ]

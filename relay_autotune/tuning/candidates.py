@@ -17,7 +17,7 @@ from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.loop.law import LawRate, Smoothing, taps_of
 from relay_autotune.loop.sampled import filter_elements
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.ultimate import unstable_at_small_gain
+from relay_autotune.process.ultimate import Crossing, first_stable
 from relay_autotune.tuning.frontier import Bounds, Candidates, Responses
 
 # Grid of filter time constant over sampling period, for interpolation.
@@ -120,19 +120,13 @@ def stable_gains(
     change = turns[cells + 1] - turns[cells]
     share = (target - turns[cells]) / change
     gains = np.exp(-(size[cells] + share * (size[cells + 1] - size[cells])))
-    crossings = list(zip(gains.tolist(), np.where(change < 0.0, 2, -2).tolist(), strict=True))
-    if model.integrators == 0 and model.gain * model.process_sign < 0.0:
-        rise = sum(z.real for z in model.zeros) - sum(t.real for t in model.time_constants)
-        crossings.append((1.0 / abs(model.gain), -1 if rise + td - tf > model.dead_time else 1))
-    on_the_right = unstable_at_small_gain(model)
-    low = 0.0 if on_the_right == 0 else math.nan
-    for gain, moved in sorted(crossings):
-        on_the_right += moved
-        if math.isnan(low) and on_the_right == 0:
-            low = gain
-        elif not math.isnan(low) and on_the_right > 0:
-            return low, gain
-    return None if math.isnan(low) else (low, math.inf)
+    moved = np.where(change < 0.0, 2, -2)
+    crossings = map(Crossing, gains.tolist(), grid[cells].tolist(), moved.tolist())
+    found = first_stable(model, crossings, td - tf)
+    if found is None:
+        return None
+    low, end = found
+    return low, math.inf if end is None else end.gain
 
 
 _SHARE = 0.95
