@@ -32,7 +32,6 @@ PROCESSES = {
     "e^(-0.5 s)/(s^2 + 0.8 s + 1)": T.oscillator(1.0, 1.0, 0.4, 0.5),
 }
 TARGETS = {
-    "PI of largest integral gain": 15,
     "PI of least IAE": 100,
     "PID of least IAE": 250,
     "PI, 100 models": 1000,
@@ -65,9 +64,6 @@ def works(model: TransferFunction) -> dict[str, partial[object]]:
         return Search(model).optimum(bounds, derivative=derivative)
 
     found = {
-        "PI of largest integral gain": partial(
-            lambda: Search(model).largest_integral_gain(bounds)
-        ),
         "PI of least IAE": partial(design, False),
         "PID of least IAE": partial(design, True),
     }

@@ -342,24 +342,6 @@ class Search:
             point, iae = self.descend(bounds, start, math.inf)
         return point, iae
 
-    def largest_integral_gain(self, bounds: Bounds) -> Controller | None:
-        """Return the PI controller of largest integral gain (MIGO, Astrom et al. 1998).
-
-        :param bounds: on the sensitivities.
-        """
-        scanned = self.scan(bounds, self._times(False))
-        if scanned is None:
-            return None
-        best, step = float(scanned.kp[np.argmax(scanned.ki)]), math.log(_DEPTH) / _GAINS[False]
-        zero = np.zeros(9)
-        while step > 1e-5:
-            kp = best * np.exp(step * np.linspace(-1.0, 1.0, 9))
-            c = Candidates(kp, zero, zero, zero)
-            c = replace(c, ki=self._limits(bounds, c)[0])
-            k = int(np.argmax(c.ki))
-            best, step = float(kp[k]), step / 4.0
-        return c.controller(k, self.model.process_sign, self.rate)
-
     def _times(self, derivative: bool) -> FloatArray:
         return _TIMES * 2.0 * math.pi / self.frequency if derivative else np.zeros(1)
 
