@@ -508,7 +508,8 @@ class JointLoop(Loop):
     @property
     def target(self) -> Target:
         """Where exported gains go."""
-        return Target(self._loop.node, self._loop.dof, is_set_up=True)
+        noise = self.client.result.transfer_function.noise_std
+        return Target(self._loop.node, self._loop.dof, noise_std=noise, is_set_up=True)
 
     def present(self) -> Controller | None:
         """Return the gains that the joint's controller has; None: it has none.

@@ -265,7 +265,7 @@ class Loop:
     @property
     def target(self) -> Target:
         """Where exported gains go."""
-        return Target()
+        return Target(noise_std=self.client.result.transfer_function.noise_std)
 
     def apply(self, doubt: str) -> tuple[bool | None, str]:  # noqa: ARG002  see JointLoop
         """Offer the gains to its controller.
@@ -486,6 +486,7 @@ class TopicLoop(Loop):
             command_min=low,
             command_max=high,
             present=options.at,
+            noise_std=self.client.result.transfer_function.noise_std,
             parameters={
                 **{name: value for name, value in sensor.items() if value != default[name]},
                 "safe_command": options.at,

@@ -765,6 +765,7 @@ def shown(
     fill_gains(message, design(task, "imc"), experiment_id="x")
     result = Tune.Result(gains=message, verdict=Tune.Result.VERDICT_TRUSTED)
     result.experiment.settings.setpoint = 50.0
+    result.transfer_function.noise_std = 0.02
     client: Any = SimpleNamespace(
         name="relay_node", result=result, record=lambda patience: record,
         identifier_values=lambda patience: None,
@@ -841,6 +842,7 @@ def test_gains_that_failed_are_not_recommended_and_their_file_says_so(
     assert "start your own controller with these gains" in shown(True, "", "passed.yaml")
     text = (tmp_path / "passed.yaml").read_text()
     assert "DOUBTFUL" not in text and "command_max: 100.0" in text
+    assert "# Noise of 0.020 y in the measurement makes one of 0.0" in text
     # It is what a controller_node of this loop starts with.
     words = with_gains_file(["--gains", "passed.yaml"])
     assert words[-1] == "controller_command:=/tank/valve"
