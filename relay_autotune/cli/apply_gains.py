@@ -41,7 +41,7 @@ from relay_autotune.text import digits, duration
 
 if TYPE_CHECKING:
     from relay_autotune.loop.gains import Controller
-    from relay_autotune.nodes.gains_client import GainsClient, StepsHere
+    from relay_autotune.nodes.gains_client import GainsClient
     from relay_autotune.nodes.loop_client import LoopClient
 
 PROGRAM = "apply_gains"
@@ -178,18 +178,18 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
         if client.has(gains):
             raise TuningError("the new gains are in force already: give --verify-only for a step")
         print("\n".join(beside(present, gains, model, width())))
-    steps = client.steps()
-    step = 0.0 if options.no_verify else options.step or _usual_step(client, steps, options)
-    tried = present if options.verify_only else gains
-    if step and tried is not None:
+    step, expected = 0.0, ""
+    if not options.no_verify:
         with Working("computing which steps the limits allow"):
-            allowed = steps.allowed(tried)
-            step = options.step or allowed.nearest(step)
-            allowed.require(step)
-            expected = "" if options.load else steps.expected(tried, step)
+            steps = client.steps(present if options.verify_only else gains)
+            alone = options.load and not steps.given
+            if step := options.step or (0.0 if alone else steps.step):
+                plan = dict(steps.plan(step))
+                expected = "" if options.load else plan.get("expected", "")
     question = _question(options, step)
-    if step and tried is not None and not options.yes:
-        agreed = bool(step := agreed_step(f"{question} {expected}".strip(), step, allowed))
+    if step and not options.yes:
+        asked = f"{question} {expected}".strip()
+        agreed = bool(step := agreed_step(asked, step, steps.allowed))
     else:
         agreed = agrees(question, yes=options.yes)
     if not agreed:
@@ -246,15 +246,6 @@ def verified(
         told = f"not known: {error}; before the proof: {_numbers(before)}"
         entries = [*found_entries(result), ("gains in force", told)]
     return result, entries
-
-
-def _usual_step(client: GainsClient, steps: StepsHere, options: argparse.Namespace) -> float:
-    if options.load and not client.values(client.name, ["verify_step"])["verify_step"]:
-        return 0.0
-    step = steps.usual()
-    if step is None:
-        raise LoopError("the height of the step is not known: give --step")
-    return step
 
 
 def _question(options: argparse.Namespace, step: float) -> str:

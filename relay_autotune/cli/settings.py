@@ -217,7 +217,9 @@ SETTINGS = (
     ),
 )  # fmt: skip
 SETTING = {each.name: each for each in SETTINGS}
+# By the parameter that they set: flags, and names.
 FLAGS = {name: flag_of(each) for each in SETTINGS for name in each.parameters}
+NAMES = {name: each.name for each in SETTINGS for name in each.parameters}
 
 
 def as_flags(text: str) -> str:
@@ -225,6 +227,18 @@ def as_flags(text: str) -> str:
     for parameter, flag in FLAGS.items():
         text = re.sub(rf"\b{parameter}\b", flag, text)
     return text
+
+
+class AnswerError(SelectionError):
+    """An answer cannot be.
+
+    :param said: what was found and expected.
+    :param setting: name of the setting.
+    """
+
+    def __init__(self, said: str, setting: str) -> None:
+        super().__init__(said)
+        self.setting = setting
 
 
 @dataclass
@@ -249,22 +263,21 @@ class Answers:
 
         :param given: numbers and ranges by the names of their settings.
         :param source: where they come from; empty: each is named by its question.
-        :raises SelectionError: if one of them cannot be, beside the others.
+        :raises AnswerError: if one of them cannot be, beside the others.
         """
         wanted = replace(self, options=argparse.Namespace(**vars(self.options)))
         for name, value in given.items():
             found, ends = _numbers(value), SETTING[name].ends
             if len(found) != ends or found != sorted(set(found)):
                 told = "two numbers, the lower one first" if ends > 1 else "one number"
-                raise SelectionError(f"{SETTING[name].question}: expected {told}")
+                raise AnswerError(f"{SETTING[name].question}: expected {told}", name)
             # A page sends whole numbers as such, which ROS does not take for a double.
             setattr(wanted.options, name, found if ends > 1 else found[0])
         for name, value in given.items():
             if why := wanted.why_impossible(name, wanted[name]):
                 whose = source or SETTING[name].question
-                raise SelectionError(
-                    f"{whose} {' '.join(map('{:g}'.format, _numbers(value)))}: {why}"
-                )
+                numbers = " ".join(map("{:g}".format, _numbers(value)))
+                raise AnswerError(f"{whose} {numbers}: {why}", name)
         vars(self.options).update(vars(wanted.options))
         self._from.update(dict.fromkeys(given, source))
 

@@ -14,7 +14,7 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, replace
@@ -22,12 +22,12 @@ from functools import partial
 from typing import Any, TypeVar
 
 from relay_autotune.analysis import options_from
-from relay_autotune.cli.after_tune import CONTROLLER, Proof, Tuned
 from relay_autotune.cli.apply_gains import found_entries, verified
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say, worst
 from relay_autotune.cli.loops import Loop
 from relay_autotune.cli.own_nodes import PROGRAM
 from relay_autotune.cli.report import flags_of
+from relay_autotune.cli.settings import NAMES
 from relay_autotune.cli.terminal import UNITS
 from relay_autotune.cli.tune_view import (
     STATES,
@@ -37,17 +37,19 @@ from relay_autotune.cli.tune_view import (
     estimate,
     oscillation,
 )
+from relay_autotune.cli.tuned import CONTROLLER, Proof, Tuned
 from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError, TuningError
 from relay_autotune.exchange.messages import (
     fill_gains,
     gains_from_message,
     identification_from_message,
+    reason_from_message,
     record_from_cycles,
 )
 from relay_autotune.experiment.early_end import ULTIMATE_GAIN
 from relay_autotune.identification.result import Identification
 from relay_autotune.loop.gains import Controller, Gains
-from relay_autotune.nodes.gains_client import GainsClient
+from relay_autotune.nodes.gains_client import GainsClient, StepsHere
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.report.case import Case, EstimatedQuantity, case_of, ultimate_of
@@ -55,7 +57,16 @@ from relay_autotune.result import Analysis
 from relay_autotune.text import digits
 from relay_autotune.verdict import Verdict
 from relay_autotune.web.address import address_of
-from relay_autotune.web.live import APPLY, CHECK, PROVE, REVERT, START, Live, PageCommand
+from relay_autotune.web.live import (
+    APPLY,
+    PROVE,
+    REVERT,
+    START,
+    VERIFY,
+    Live,
+    PageCommand,
+    PagePlan,
+)
 from relay_autotune.web.server import Page, in_background
 from relay_autotune.web.shape import DesignRequest, PageModel
 from relay_autotune.web.wire import curve, of_running
@@ -129,8 +140,6 @@ class _LoopOnPage:
         self._ends: list[int] = []
         self._heeded = 0
         self._at_first: Callable[[], object] | None = None
-        # What the loop itself says of the next tune.
-        self._plan: list[str] = []
 
     def run(self, interrupted: list[int]) -> int:
         """Do what is wished on the page, until a signal comes.
@@ -144,21 +153,15 @@ class _LoopOnPage:
         self._live.tell(status="nothing is commanded before a tune is started here")
         try:
             self._show_signals()
-            self._show_form()
             while not interrupted:
                 self._client.rest(_TICK)
                 wish = self._live.next_wish()
                 if wish is None:
-                    if self._gains.look_now_and_then():
-                        # It shows what the next tune would take, too.
-                        self._show_form()
-                elif wish.what in (CHECK, START):
-                    if not self._is_set(wish):
-                        continue
-                    if wish.what == START:
-                        status = self._tune()
-                    else:
-                        self._check()
+                    self._gains.look_now_and_then()
+                elif wish.dry:
+                    self._show_plan(wish)
+                elif wish.what == START:
+                    status = self._tune(wish) or status
                 else:
                     with self._commands_shown():
                         self._gains.do(wish)
@@ -196,51 +199,58 @@ class _LoopOnPage:
         )
         self._cycles.append(cycle)
 
-    def _show_form(self) -> None:
-        """Show the settings of the next tune."""
-        self._loop.look()
-        needed = self._loop.has_own_nodes
-        self._live.tell(form=tuple(self._loop.answers.form(self._loop.form, needed=needed)))
-
-    def _is_set(self, wish: PageCommand) -> bool:
-        """Take the settings with which a tune is to run; return whether they can be."""
-        live = self._live
-        try:
-            if wish.settings:
-                self._loop.set(dict(wish.settings))
-            if lacking := self._loop.lacking():
-                told = "; ".join(lacking)
-                raise SelectionError(f"fill in the plan first (Start a tune): {told}")
-            self._loop.before_tune()
-            self._plan = self._loop.plan()
-        except RelayAutotuneError as error:
-            checked = live.told.checked + 1
-            live.rest(str(error), good=False, checks=(), checked=checked, accepted=False)
-            return False
-        finally:
-            self._show_form()
-        return True
-
-    def _check(self) -> None:
-        """Ask whether a tune could start, and how."""
-        self._live.tell(phase="checking", status="looking at the loop", tone="")
-        result = self._loop.check()
-        accepted = self._client.succeeded
+    def _show_plan(self, wish: PageCommand) -> None:
+        """Say what a wish would do, or why it cannot be done; nothing moves."""
+        self._live.tell(phase="checking")
+        plan = self._check(wish) if wish.what == START else self._gains.plan(wish)
         self._live.forget_wishes()
-        self._live.rest(
-            "a tune can start" if accepted else f"refused: {result.reason}",
-            good=accepted,
-            checks=tuple(map(check_parts, [*self._plan, *self._loop.checklist(result)])),
-            checked=self._live.told.checked + 1,
-            accepted=accepted,
-            limits=tuple(self._options.within or ()),
-        )
+        self._live.tell(phase="idle", plan=replace(plan, number=wish.dry))
 
-    def _tune(self) -> int:
+    def _check(self, wish: PageCommand) -> PagePlan:
+        """Ask whether a tune could start, and how."""
+        loop, refusal, refused, lines = self._loop, "", "", list[str]()
+        try:
+            self._take(wish)
+            lines = loop.plan()
+            result = loop.check()
+            lines += loop.checklist(result)
+            self._live.tell(limits=tuple(self._options.within or ()))
+            if not self._client.succeeded:
+                refusal = f"refused: {result.reason}"
+                named = (
+                    reason_from_message(why).parameter
+                    for check, why in zip(result.checks, result.refusals, strict=False)
+                    if check.startswith("NO")
+                )
+                refused = next((NAMES[each] for each in named if each in NAMES), "")
+        except RelayAutotuneError as error:
+            refusal, refused = str(error), getattr(error, "setting", "")
+        loop.look()
+        form = loop.answers.form(loop.form, needed=loop.has_own_nodes)
+        return PagePlan(0, refusal, refused, tuple(map(check_parts, lines)), tuple(form))
+
+    def _take(self, wish: PageCommand) -> None:
+        """Take the settings with which a tune is to run.
+
+        :raises RelayAutotuneError: if they cannot be.
+        """
+        if wish.settings:
+            self._loop.set(dict(wish.settings))
+        if lacking := self._loop.lacking():
+            told = "; ".join(lacking)
+            raise SelectionError(f"fill in the plan first (Start a tune): {told}")
+        self._loop.before_tune()
+
+    def _tune(self, wish: PageCommand) -> int:
         """Tune until the result is there."""
         client, live = self._client, self._live
         live.forget_wishes()
         before = live.told
+        try:
+            self._take(wish)
+        except RelayAutotuneError as error:
+            live.rest(str(error), good=False)
+            return DONE
         self._cycles.clear()
         self._ultimate, self._ends, self._heeded = {}, [], len(self._interrupted)
         live.show("model", None)
@@ -456,10 +466,9 @@ class GainsPage:
     leave: Callable[[], bool]
     _controller: GainsClient | None = None
     _looked: float = -math.inf
-    # The usual step [y]; None: to be read anew.
-    _step: float | None = None
-    # The last tune with gains.
+    # The last tune with gains, and which steps may prove some gains: computed once.
     _tuned: Tuned | None = None
+    _known: tuple[Controller | None, Proof | StepsHere] | None = None
 
     def close(self) -> None:
         """Leave the controller."""
@@ -467,12 +476,10 @@ class GainsPage:
             self._controller.close()
             self._controller = None
 
-    def look_now_and_then(self) -> bool:
-        """Read the gains in force, at an interval; return whether it is over."""
-        is_due = time.monotonic() - self._looked > _LOOK_EVERY
-        if is_due:
+    def look_now_and_then(self) -> None:
+        """Read the gains in force, at an interval."""
+        if time.monotonic() - self._looked > _LOOK_EVERY:
             self.look()
-        return is_due
 
     def look(self) -> None:
         """Read the gains in force, and show them beside the new ones."""
@@ -485,123 +492,164 @@ class GainsPage:
         self._looked = time.monotonic()
         if (controller := self._controller) is None:
             if self.live.told.controller:
-                self.live.tell(controller="", present="", step=math.nan)
+                self.live.tell(controller="", present="")
             return
         try:
             present = controller.in_force()
-            # It comes of the record of the tune, which is large.
-            if self._step is None:
-                self._step = controller.steps().usual() or math.nan
         except RelayAutotuneError:
             # It may be about to end: the next look tells.
             return
-        self.live.tell(controller=controller.name, present=_said(present), step=self._step)
+        self.live.tell(controller=controller.name, present=_said(present))
         for subject in self.page.subjects:
             if subject.loop == self.number and subject.case.present != present:
                 subject.case = replace(subject.case, present=present)
 
     def look_after_tune(self, tune: Tuned) -> None:
-        """Read the gains in force, and the usual step, which comes of the tune.
+        """Read the gains in force; those of the tune may be proven.
 
         :param tune: that has ended.
         """
-        self._step = None
+        self._known = None
         self.look()
         if self.loop.proves and tune.has_gains:
-            try:
-                self._tuned = tune
-                proof = Proof(tune)
-            except RelayAutotuneError as error:
-                say(PROGRAM, f"the gains cannot be proven: {error}")
-                self.live.tell(proves=False)
-            else:
-                self.live.tell(proves=True, step=proof.step, steps=proof.allowed.words, proof=())
+            self._tuned = tune
+            self.live.tell(proves=True, proof=())
+
+    # What a wish would do.
+
+    def plan(self, wish: PageCommand) -> PagePlan:
+        """Return what a wish would do, or why it cannot be done.
+
+        :param wish: to apply, prove, verify or revert.
+        """
+        step, refusal, lines = wish.step, "", list[tuple[str, ...]]()
+        makes_step = wish.what in (PROVE, VERIFY)
+        try:
+            message = self._message(wish)
+            lines += self._about_gains(wish, message)
+            if makes_step:
+                steps = self._steps(message)
+                step = step or steps.step
+                lines += [("", *line) for line in steps.plan(step)]
+                lines.append(("", "allowed", steps.allowed.words))
+        except RelayAutotuneError as error:
+            refusal = str(error)
+        asked = {"name": "step", "question": "step of the set-point", "unit": "y", "ends": 1,
+                 "values": [step or None], "now": "", "needed": True}  # fmt: skip
+        refused = "step" * bool(step and refusal)
+        return PagePlan(0, refusal, refused, tuple(lines), (asked,) * makes_step)
+
+    def _about_gains(self, wish: PageCommand, message: Any) -> Iterator[tuple[str, ...]]:
+        """Yield the lines of a plan that say which gains are there, and which come."""
+        after = ""
+        if not self.loop.proves:
+            self._found()
+            yield "", "now", f"{self.live.told.controller} has {self.live.told.present}"
+            after = "; at once, without a bump of the command"
+        if message is not None:
+            yield "", "gains", f"{_said(gains_from_message(message))}{after}"
+            if message.verdict != PidGains.VERDICT_TRUSTED:
+                yield "note", "doubtful", message.verdict_reason
+        if wish.what == REVERT:
+            yield "", "gains", f"those before{after}"
+        elif wish.what == APPLY:
+            yield "", "step", "none: they are not verified"
+        elif not self.loop.proves:
+            yield "", "if it fails", "the gains before come back by themselves"
+
+    def _steps(self, message: Any) -> Proof | StepsHere:
+        """Return which steps may prove gains.
+
+        :param message: the `PidGains`; None: those in force.
+        """
+        if self.loop.proves and self._tuned is None:
+            raise TuningError("there are no gains of a tune that could be proven here")
+        gains = self._found().in_force() if message is None else gains_from_message(message)
+        if self._known is None or self._known[0] != gains:
+            steps = Proof(self._tuned, message) if self._tuned else self._found().steps(gains)
+            self._known = gains, steps
+        return self._known[1]
+
+    def _found(self) -> GainsClient:
+        """Return the client of the running controller_node."""
+        if self._controller is None:
+            raise LoopError("no controller_node is in this namespace")
+        self._controller.find(_FOUND_WITHIN)
+        return self._controller
+
+    # What is done.
 
     def do(self, wish: PageCommand) -> None:
         """Do what was wished with the gains in force.
 
-        :param wish: to apply, verify or revert.
+        :param wish: to apply, prove, verify or revert.
         """
-        live, controller = self.live, self._controller
+        live = self.live
         live.forget_wishes()
-        if wish.dry:
-            self._say_plan(wish)
-            return
         try:
-            if wish.what == PROVE:
-                self._prove(wish)
-            elif controller is None:
-                raise LoopError("no controller_node is in this namespace")
-            else:
-                controller.find(_FOUND_WITHIN)
-                self._do(wish, controller)
+            self._do(wish)
         except RelayAutotuneError as error:
             live.rest(str(error), good=False)
         if live.told.window[1:] == (0.0,):
             live.tell(window=(live.told.window[0], live.now))
         live.forget_wishes()
+        # Limits and gains may be others at the next wish.
+        self._known = None
         self.look()
 
-    def _do(self, wish: PageCommand, controller: GainsClient) -> None:
+    def _do(self, wish: PageCommand) -> None:
         live = self.live
         if wish.what == REVERT:
             live.tell(phase="applying", tone="", status="bringing back the gains before")
-            live.rest(controller.ask("revert"), good=True, proof=())
+            live.rest(self._found().ask("revert"), good=True, proof=())
             return
+        message = self._message(wish)
+        steps = None if wish.what == APPLY else self._steps(message)
+        if isinstance(steps, Proof):
+            self._prove(steps, wish, message)
+            return
+        controller = self._found()
         with controller.accepting_doubtful() if wish.doubtful else nullcontext():
-            if wish.what == APPLY:
+            if steps is None:
                 live.tell(phase="applying", tone="", status="putting the gains in force")
-                message = self._message(wish)
-                if not wish.step:
-                    told = controller.put_in_force(message)
-                    live.rest(f"{told}; they are not verified", good=True, proof=())
-                    return
-                controller.steps().allowed(gains_from_message(message)).require(wish.step)
-                with controller.offered(message) as gains:
-                    self._verify(wish, controller, gains)
+                told = controller.put_in_force(message)
+                live.rest(f"{told}; they are not verified", good=True, proof=())
                 return
-            if (present := controller.in_force()) is not None:
-                controller.steps().allowed(present).require(wish.step)
-            self._verify(wish, controller, None)
+            step = wish.step or steps.step
+            steps.allowed.require(step)
+            with controller.offered(message) if message else nullcontext() as gains:
+                self._verify(controller, step, gains)
 
-    def _prove(self, wish: PageCommand) -> None:
+    def _prove(self, proof: Proof, wish: PageCommand, message: Any) -> None:
         """Prove gains by a controller_node of the command, which ends after it."""
-        live, message = self.live, self._message(wish)
-        proof = self._proof(message)
-        proof.allowed.require(wish.step)
+        live, step = self.live, wish.step or proof.step
+        proof.allowed.require(step)
         self._begin_step(f"starting {CONTROLLER}")
         result = proof.made(
-            wish.step, wish.doubtful, lambda text: live.tell(status=text), self.leave,
-            self._show_steps,
-        )  # fmt: skip
-        left = f"the command stands at {self.loop.options.at:.6g} u"
-        live.rest(
-            f"proof {'passed' if result.passed else 'failed'}: {result.reason}; {left}",
-            good=result.passed,
-            proof=(
-                ("gains", f"{_said(gains_from_message(message))}, at {time.strftime('%H:%M')}"),
-                *found_entries(result),
-            )
-            if result.steps
-            else live.told.proof,
+            step, wish.doubtful, lambda text: live.tell(status=text), self.leave, self._show_steps
         )
+        left = f"; the command stands at {self.loop.options.at:.6g} u"
+        gains = ("gains", f"{_said(gains_from_message(message))}, at {time.strftime('%H:%M')}")
+        self._rest("proof", result, [gains, *found_entries(result)], left)
 
-    def _proof(self, message: Any) -> Proof:
-        if self._tuned is None:
-            raise TuningError("there are no gains of a tune that could be proven here")
-        return Proof(self._tuned, message)
+    def _verify(self, controller: GainsClient, step: float, new: Controller | None) -> None:
+        live = self.live
+        self._begin_step("")
+        result, entries = verified(
+            controller, step, lambda text: live.tell(status=text), self.leave, new
+        )
+        self._show_steps(controller.steps_of(result))
+        self._rest("verification", result, entries)
 
-    def _say_plan(self, wish: PageCommand) -> None:
-        """Say what a proof would do, or why it cannot be made; nothing moves."""
-        live, plan, refusal = self.live, "", ""
-        live.tell(phase="checking")
-        try:
-            proof = self._proof(self._message(wish))
-            live.tell(steps=proof.allowed.words)
-            plan = proof.plan(wish.step)
-        except RelayAutotuneError as error:
-            refusal = str(error)
-        live.tell(phase="idle", plan=plan, refusal=refusal, planned=live.told.planned + 1)
+    def _rest(
+        self, what: str, result: Any, entries: Sequence[tuple[str, str]], left: str = ""
+    ) -> None:
+        """Tell how a step has ended; the proof before stays where it was cut short."""
+        self.live.rest(
+            f"{what} {'passed' if result.passed else 'failed'}: {result.reason}{left}",
+            good=result.passed,
+            proof=tuple(entries) if result.steps else self.live.told.proof,
+        )
 
     def _show_steps(self, steps: Sequence[Any]) -> None:
         """Show a proof in place of the one before; one that was cut short has no steps."""
@@ -617,7 +665,9 @@ class GainsPage:
         )  # fmt: skip
 
     def _message(self, wish: PageCommand) -> Any:
-        """Return the gains that the page shows as a message."""
+        """Return the gains that the page shows as a message; None: those in force are meant."""
+        if wish.what in (VERIFY, REVERT):
+            return None
         if wish.asked is None or not 0 <= wish.of < len(self.page.subjects):
             raise TuningError("there are no such gains")
         subject: PageModel = self.page.subjects[wish.of]
@@ -631,19 +681,6 @@ class GainsPage:
         message = PidGains()
         fill_gains(message, gains, experiment_id=subject.case.experiment_id, judgement=judgement)
         return message
-
-    def _verify(self, wish: PageCommand, controller: GainsClient, new: Controller | None) -> None:
-        live = self.live
-        self._begin_step("")
-        result, entries = verified(
-            controller, wish.step, lambda text: live.tell(status=text), self.leave, new
-        )
-        self._show_steps(controller.steps_of(result))
-        live.rest(
-            f"verification {'passed' if result.passed else 'failed'}: {result.reason}",
-            good=result.passed,
-            proof=tuple(entries) if result.steps else live.told.proof,
-        )
 
 
 def _said(gains: Controller | None) -> str:

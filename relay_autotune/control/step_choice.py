@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -90,6 +91,7 @@ class StepChoice:
     :param record: of the tune, with its settings; the loop rests about its set-point and mean
         command.
     :param model: the process.
+    :param control: the gains, and what runs them.
     :param measurement: its range [y].
     :param command: its range [u].
     :param noise_std: of :func:`noise_of` [y].
@@ -97,6 +99,7 @@ class StepChoice:
 
     record: Record
     model: TransferFunction
+    control: Control
     measurement: Limits
     command: Limits
     noise_std: float
@@ -126,41 +129,47 @@ class StepChoice:
         height = max(min(wanted, _OF_ROOM * room), clear)
         return sign * float(f"{height:.2g}")
 
-    def plan(self, control: Control, step: float) -> Plan:
-        """Return the plan of a step of the set-point.
+    @cached_property
+    def _plan(self) -> Plan:
+        """The plan of a step by 1; without limits a step of any height is in proportion.
 
-        :param control: the gains, and what runs them.
-        :param step: y.
         :raises TuningError: as :func:`plan`.
         """
-        return plan(control, self.model, Step(setpoint=step), self.record.mean_interval)
+        return plan(self.control, self.model, Step(setpoint=1.0), self.record.mean_interval)
 
-    def allowed(self, wanted: Plan) -> StepRange:
-        """Return the steps that limits allow and noise does not hide, in two digits.
+    @property
+    def lasts(self) -> float:
+        """How long a step is observed [s]."""
+        return self._plan.duration
+
+    @cached_property
+    def allowed(self) -> StepRange:
+        """The steps that limits allow and noise does not hide, in two digits.
 
         The predicted peak, with an allowance for the noise, stays within the limits of the
         measurement, and the command can hold the new set-point.
 
-        :param wanted: for a step of the set-point by 1.
+        :raises TuningError: as :func:`plan`.
         """
         assert self.record.settings is not None
         setpoint, spared = self.record.settings.setpoint, NOISE_ALLOWANCE * self._noise
         low, high = setpoint - self.measurement.low, self.measurement.high - setpoint
         down, up = self._ways
         return StepRange(
-            0.0 - _rounded_down(min(down, (low - spared) / wanted.peak)),
-            _rounded_down(min(up, (high - spared) / wanted.peak)),
-            rounded_up(wanted.visible * self._noise),
+            0.0 - _rounded_down(min(down, (low - spared) / self._plan.peak)),
+            _rounded_down(min(up, (high - spared) / self._plan.peak)),
+            rounded_up(self._plan.visible * self._noise),
         )
 
-    def expected(self, wanted: Plan) -> str:
+    def expected(self, step: float) -> str:
         """Return the predicted range of the command with a step, for people.
 
-        :param wanted: for the step.
+        :param step: of the set-point [y].
+        :raises TuningError: as :func:`plan`.
         """
         assert self.record.settings is not None
         rest = self.record.settings.baseline
-        low, high = (self.command.clip(rest + end) for end in wanted.command)
+        low, high = sorted(self.command.clip(rest + step * end) for end in self._plan.command)
         return f"from {low:.3g} to {high:.3g} u"
 
     @property

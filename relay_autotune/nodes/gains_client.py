@@ -10,7 +10,7 @@ import shlex
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any
 
 from action_msgs.msg import GoalStatus
@@ -222,9 +222,35 @@ class GainsClient(LoopClient):
             with suppress(LoopError):
                 self.set_values(self.name, before)
 
-    def steps(self) -> StepsHere:
-        """Return the steps that may prove gains here."""
-        return StepsHere(self)
+    def steps(self, gains: Controller | None) -> StepsHere:
+        """Return the steps of the set-point that may prove gains here.
+
+        :param gains: those that are to make the step; None: there are none.
+        :raises RelayAutotuneError: if the model is not there.
+        """
+        given = float(self.values(self.name, ["verify_step"])["verify_step"])
+        found = self.latched(
+            RelayExperiment, "relay_experiment", lambda m: len(m.cycle_start) > 1, _RESULT_WITHIN
+        )
+        if found is None or gains is None:
+            return StepsHere(None, given)
+        low, high, least, most = self.values(self.name, LIMITS).values()
+        limits = Limits(low, high), Limits(least, most)
+        model, noise = self.identified()
+        control = self._control(gains)
+        return StepsHere(
+            StepChoice(record_from_message(found), model, control, *limits, noise), given
+        )
+
+    def _control(self, gains: Controller) -> Control:
+        """Return gains as they run in the node that controls."""
+        names = ("law", "law_period", "apply_to", "apply_feedforward")
+        values = self.values(self.name, names)
+        if not values["apply_to"]:
+            return Control(gains, rate_from(values))
+        newest, _ = self.waiting()
+        rate = rate_of(newest.law, newest.law_period)
+        return in_another_node(gains, rate, values["apply_feedforward"])
 
     def prove(
         self,
@@ -373,73 +399,46 @@ class GainsClient(LoopClient):
                 raise GoneError(f"{self.name} has not ended the verification")
 
 
+@dataclass(frozen=True)
 class StepsHere:
     """The steps of the set-point that may prove gains of a controller_node.
 
-    They follow from the record of its tune, which is large and is asked for once.
-
-    :param client: of the node, which was found.
+    :param choice: what decides them; None: no tune has left its record, without which it is not
+        known where the loop rests, and the node alone refuses.
+    :param given: the step of the node [y]; 0: none.
     """
 
-    def __init__(self, client: GainsClient) -> None:
-        self._client = client
+    choice: StepChoice | None
+    given: float
 
-    @cached_property
-    def _choice(self) -> StepChoice | None:
-        """What decides the step; None: no tune has left its record."""
-        client = self._client
-        found = client.latched(
-            RelayExperiment, "relay_experiment", lambda m: len(m.cycle_start) > 1, _RESULT_WITHIN
-        )
-        if found is None:
-            return None
-        low, high, least, most = client.values(client.name, LIMITS).values()
-        limits = Limits(low, high), Limits(least, most)
-        model, noise = client.identified()
-        return StepChoice(record_from_message(found), model, *limits, noise)
+    @property
+    def allowed(self) -> StepRange:
+        """The steps that the limits of the node allow.
 
-    def usual(self) -> float | None:
-        """Return the step of the node, else the one that proves most within its limits [y].
-
-        :raises RelayAutotuneError: if the model is not there.
+        :raises TuningError: if the loop would be unstable.
         """
-        if given := self._client.values(self._client.name, ["verify_step"])["verify_step"]:
-            return float(given)
-        return self._choice.best or None if self._choice else None
+        return StepRange() if self.choice is None else self.choice.allowed
 
-    def allowed(self, gains: Controller) -> StepRange:
-        """Return the steps that the limits of the node allow.
+    @property
+    def step(self) -> float:
+        """The step of the node, else the one that proves most within its limits [y].
 
-        Without the record of a tune it is not known where the loop rests: the node alone refuses.
-
-        :param gains: those that are to make the step.
-        :raises RelayAutotuneError: if the model is not there, or the loop would be unstable.
+        :raises LoopError: if it is not known.
         """
-        if self._choice is None:
-            return StepRange()
-        return self._choice.allowed(self._choice.plan(self._control(gains), 1.0))
+        if not (step := self.given or (self.choice.best if self.choice else 0.0)):
+            raise LoopError("the height of the step is not known: give --step")
+        return self.allowed.nearest(step)
 
-    def expected(self, gains: Controller, step: float) -> str:
-        """Say what a step will do; empty: no tune has left its record.
+    def plan(self, step: float) -> tuple[tuple[str, str], ...]:
+        """Return what a step will do, in sentences with a name for each.
 
-        :param gains: those that are to make the step.
-        :param step: y.
-        :raises RelayAutotuneError: as :meth:`allowed`.
+        :param step: of the set-point [y].
+        :raises TuningError: if it is not allowed.
         """
-        if self._choice is None:
-            return ""
-        wanted = self._choice.plan(self._control(gains), step)
-        return (
-            f"The command is expected {self._choice.expected(wanted)}, for about "
-            f"{duration(wanted.duration)}."
-        )
-
-    def _control(self, gains: Controller) -> Control:
-        """Return gains as they run in the node that controls."""
-        client, names = self._client, ("law", "law_period", "apply_to", "apply_feedforward")
-        values = client.values(client.name, names)
-        if not values["apply_to"]:
-            return Control(gains, rate_from(values))
-        newest, _ = client.waiting()
-        rate = rate_of(newest.law, newest.law_period)
-        return in_another_node(gains, rate, values["apply_feedforward"])
+        self.allowed.require(step)
+        moves = f"The set-point steps by {step:+g} y and back, once the loop is at rest."
+        if self.choice is None:
+            return (("moves", moves),)
+        told, lasts = self.choice.expected(step), duration(self.choice.lasts)
+        expected = f"The command is expected {told}, for about {lasts}."
+        return ("moves", moves), ("expected", expected)

@@ -29,9 +29,9 @@ from relay_autotune.web.wire import curve
 
 # Samples of each signal that are kept for a page that is opened late.
 _KEPT = 50_000
-CHECK, START, ABORT = "check", "start", "abort"
+START, ABORT = "start", "abort"
 APPLY, VERIFY, REVERT, PROVE = "apply", "verify", "revert", "prove"
-WISHES = (CHECK, START, ABORT, APPLY, VERIFY, REVERT, PROVE)
+WISHES = (START, ABORT, APPLY, VERIFY, REVERT, PROVE)
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,14 @@ class PageCommand:
     of: int = quantity(0, lower=0).means("Number of the model whose gains are meant.")
     asked: DesignRequest | None = None
     """What these gains were asked for by; None: no gains are meant."""
-    step: float = quantity(0.0, "y").means("Of the set-point, to verify the gains; 0: none.")
+    step: float = quantity(0.0, "y").means(
+        "Of the set-point, that proves gains; 0: the usual one."
+    )
     doubtful: bool = False
     """Whether gains whose verdict is not trusted are accepted."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Of the loop by name, with which a tune is to run: a number, or the two ends of a range."""
-    dry: bool = False
-    """Whether it is only to be said what a proof would do."""
+    dry: int = quantity(0, lower=0).means("Number of the question what it would do; 0: do it.")
 
     def __post_init__(self) -> None:
         check(self, TuningError)
@@ -64,11 +65,28 @@ class PageCommand:
 
 
 @dataclass(frozen=True)
+class PagePlan:
+    """What a wish would do, as it is told before anything moves.
+
+    :param number: of the question.
+    :param refusal: why it cannot be done; empty: it can.
+    :param refused: name of the answer that is refused; empty: none in particular.
+    :param lines: what will be done and what was checked: mark, name and what was found.
+    :param form: what is asked for: name, question, unit, value and what is seen now.
+    """
+
+    number: int = 0
+    refusal: str = ""
+    refused: str = ""
+    lines: tuple[tuple[str, ...], ...] = ()
+    form: tuple[Mapping[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
 class Told:
     """What is known of the tune besides its samples.
 
     :param node: name of the loop.
-    :param form: the settings of the next tune: name, question, unit, value and what is seen now.
     :param phase: "idle", "checking", "tuning", "analysing", "applying", "verifying" or "lost".
     :param state: what the experiment does, a word.
     :param status: what it waits for and what it sees, a sentence.
@@ -83,20 +101,13 @@ class Told:
     :param limits: lowest and highest measurement that a tune may see [y]; empty: not known.
     :param levels: the two commands of the relay [u]; empty: not known yet.
     :param window: when the last tune began, and its end [s of the samples]; 0: it runs.
-    :param checks: of the last check: mark, name and what was found.
-    :param checked: number of checks so far.
-    :param accepted: whether a tune could start, as far as the last check knows.
     :param result: lines of the last result.
     :param began: time of the day at which the last tune began.
     :param tuned: number of the model that it has given; -1: none.
     :param controller: full name of the controller_node; empty: there is none.
     :param present: its gains, in words.
     :param proves: whether a controller_node of the command can prove gains.
-    :param step: of its set-point that verifies gains as usual [y]; NaN: not known.
-    :param planned: number of proofs so far of which it was said what they would do.
-    :param plan: what the last of these would do; empty: it cannot be made.
-    :param refusal: why.
-    :param steps: the steps that may prove the gains, in words.
+    :param plan: what was asked for last would do.
     :param proof: of the last verification: names and texts.
     """
 
@@ -112,24 +123,16 @@ class Told:
     process: str = ""
     setpoint: float = math.nan
     hysteresis: float = math.nan
-    form: tuple[Mapping[str, Any], ...] = ()
     limits: tuple[float, ...] = ()
     levels: tuple[float, ...] = ()
     window: tuple[float, ...] = ()
-    checks: tuple[tuple[str, ...], ...] = ()
-    checked: int = 0
-    accepted: bool = False
     result: tuple[str, ...] = ()
     began: str = ""
     tuned: int = -1
     controller: str = ""
     present: str = ""
     proves: bool = False
-    step: float = math.nan
-    planned: int = 0
-    plan: str = ""
-    refusal: str = ""
-    steps: str = ""
+    plan: PagePlan = PagePlan()
     proof: tuple[tuple[str, str], ...] = ()
 
 

@@ -43,7 +43,7 @@ from relay_autotune.web.live import Live, PageCommand
 from relay_autotune.web.shape import DesignRequest, PageModel, asked_of
 from relay_autotune.web.worker import Worker, yield_to_nodes
 
-_STATIC = ("page.html", "page.css", "page.js", "plot.js", "live.js")
+_STATIC = ("page.html", "page.css", "page.js", "plot.js", "plan.js", "live.js")
 # No script, style or connection but those of this server, and no page around ours.
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "
@@ -448,7 +448,7 @@ class _Socket(_Guarded, WebSocketHandler):
             question.get("step", 0.0),
             question.get("accept_doubtful") is True,
             dict(question.get("settings", {})),
-            question.get("dry") is True,
+            question.get("dry", 0),
         )
 
     def _tell_news(self) -> None:

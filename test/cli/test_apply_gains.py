@@ -9,6 +9,7 @@ import math
 import os
 import signal
 import sys
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -24,12 +25,13 @@ from relay_autotune.errors import LoopError, TuningError
 from relay_autotune.exchange.messages import fill_gains, fill_reason
 from relay_autotune.loop.analysis import performance_beside
 from relay_autotune.loop.gains import Controller
+from relay_autotune.nodes.gains_client import StepsHere
 from relay_autotune.nodes.verifier import without_arrays
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code
 from relay_autotune.tuning import design
 from relay_autotune.tuning.task import DesignOptions, DesignTask
-from relay_autotune.web.live import APPLY, VERIFY, PageCommand
+from relay_autotune.web.live import PROVE, VERIFY, Live, PageCommand
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, Verification
 
@@ -147,6 +149,25 @@ def test_the_result_of_a_step_carries_no_samples() -> None:
     assert (summary.reason, summary.passed) == (whole.reason, True)
 
 
+@dataclass(frozen=True)
+class StepsWithin:
+    """Steps that a node allows up to a height; the usual one is higher."""
+
+    high: float
+
+    @property
+    def allowed(self) -> StepRange:
+        return StepRange(-1.5, self.high)
+
+    @property
+    def step(self) -> float:
+        return self.allowed.nearest(3.0)
+
+    def plan(self, step: float) -> tuple[tuple[str, str], ...]:
+        self.allowed.require(step)
+        return (("expected", f"The command goes to {step:g} u."),)
+
+
 def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -154,11 +175,8 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     client: Any = SimpleNamespace(
         in_force=lambda: None, identified=lambda: (MODEL, 0.01),
         waiting=lambda: (GAINS, ""), has=lambda gains: False, ask=asked.append,
-        steps=lambda: SimpleNamespace(
-            usual=lambda: 3.0, expected=lambda gains, step: f"The command goes to {step:g} u.",
-            allowed=lambda gains: StepRange(-1.5, 2.0 if gains is GAINS else 0.0),
-        ),
-        values=lambda node, names: {"verify_step": 0.0}, name="controller_node",
+        steps=lambda gains: StepsWithin(2.0 if gains is GAINS else 0.0),
+        name="controller_node",
     )  # fmt: skip
     given = apply_gains._parser().parse_args(["--yes", "--step", "2.5"])
     with pytest.raises(TuningError, match=r"is 2.5 y, expected from -1.5 to 2 y"):
@@ -181,11 +199,7 @@ def client_of(prove: Any, in_force: Any) -> Any:
     return SimpleNamespace(
         in_force=in_force, identified=lambda: (MODEL, 0.01),
         waiting=lambda: (GAINS, ""), has=lambda gains: in_force() is gains,
-        steps=lambda: SimpleNamespace(
-            allowed=lambda gains: StepRange(), expected=lambda gains, step: ""
-        ),
-        name="controller_node", prove=prove,
-        values=lambda node, names: {"verify_step": 0.0},
+        steps=lambda gains: StepsHere(None, 0.0), name="controller_node", prove=prove,
     )  # fmt: skip
 
 
@@ -232,16 +246,27 @@ def gone(present: list[Any]) -> Any:
 def test_the_page_refuses_a_step_beyond_the_limits_before_anything_changes() -> None:
     changed: list[Any] = []
     controller: Any = SimpleNamespace(
-        in_force=lambda: Controller(0.1, 3.0),
-        steps=lambda: SimpleNamespace(allowed=lambda gains: StepRange(-1.5, 2.0)),
+        in_force=lambda: Controller(0.1, 3.0), steps=lambda gains: StepsWithin(2.0),
         offered=changed.append, prove=lambda *words: changed.append(words),
+        name="/controller_node", find=lambda patience: None,
     )  # fmt: skip
-    live: Any = SimpleNamespace(tell=lambda **told: None, show=lambda *shown: None)
-    page = GainsPage(Any, live, Any, 0, lambda: False)  # type: ignore[arg-type]
-    page._message = lambda wish: MESSAGE  # type: ignore[method-assign]
-    for what in (VERIFY, APPLY):
-        with pytest.raises(TuningError, match=r"is -1.6 y, expected from -1.5 to 2 y"):
-            page._do(PageCommand(what, step=-1.6), controller)
+    loop: Any = SimpleNamespace(
+        proves=False, client=SimpleNamespace(controllers=lambda: ["/controller_node"])
+    )
+    live = Live("/relay_node")
+    page = GainsPage(loop, live, SimpleNamespace(subjects=[]), 0, lambda: False)  # type: ignore[arg-type]
+    page._controller = controller
+    page._message = lambda wish: None if wish.what == VERIFY else MESSAGE  # type: ignore[method-assign]
+    for what in (VERIFY, PROVE):
+        refused = page.plan(PageCommand(what, step=-1.6, dry=1))
+        assert "is -1.6 y, expected from -1.5 to 2 y" in refused.refusal
+        assert refused.refused == "step"
+        page.do(PageCommand(what, step=-1.6))
+        assert live.told.status == refused.refusal
+        # the usual one is as high as allowed, and stands in the field
+        usual = page.plan(PageCommand(what, dry=2))
+        assert (usual.refusal, usual.form[0]["values"]) == ("", [2.0])
+        assert ("", "expected", "The command goes to 2 u.") in usual.lines
     assert not changed
 
 

@@ -44,7 +44,7 @@ from relay_autotune.cli.terminal import (
 )
 from relay_autotune.cli.tune_page import _LoopOnPage
 from relay_autotune.control.step_choice import StepRange
-from relay_autotune.errors import LoopError, ParameterError, SelectionError
+from relay_autotune.errors import LoopError, NotReadyError, ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS, Target, exported
 from relay_autotune.exchange.messages import fill_gains, fill_reason
 from relay_autotune.nodes import loop_client, shell
@@ -568,19 +568,50 @@ def test_a_form_with_what_cannot_be_changes_nothing(changed: dict[str, Any]) -> 
     assert vars(given) == before
 
 
-def test_a_check_before_the_plan_is_filled_says_what_is_missing() -> None:
+def test_a_plan_says_what_is_missing_or_which_answer_cannot_be_and_leaves_the_status() -> None:
     client: Any = Looker(measures=44.0)
-    client.check = None
+    client.check, client.name, client.set_values = None, "/relay_node", None
     loop = TopicLoop(client, options("--web", "--within", "30", "50"))
     live = Live("tank")
+    live.tell(status="proof passed", tone="good")
     shown: Any = _LoopOnPage.__new__(_LoopOnPage)
     shown._loop, shown._live, shown._client, shown._options = loop, live, client, loop.options
-    assert not shown._is_set(PageCommand("check"))
-    assert "present command" in live.told.status and "command of the actuator" in live.told.status
-    assert "measurement" not in live.told.status and not live.told.accepted
+    shown._show_plan(PageCommand("start", dry=7))
+    plan = live.told.plan
+    assert "present command" in plan.refusal and "command of the actuator" in plan.refusal
+    assert "measurement" not in plan.refusal and (plan.number, plan.refused) == (7, "")
+    assert [row["values"] for row in plan.form] == [[None], [30.0, 50.0], None, [0.0]]
+    answers = {"at": 2, "within": [50, 60], "command_within": [0, 5]}
+    shown._show_plan(PageCommand("start", dry=8, settings=answers))
+    assert (live.told.plan.number, live.told.plan.refused) == (8, "within")
+    assert "the measurement is 44 now: give limits around it" in live.told.plan.refusal
+    assert (live.told.phase, live.told.status, live.told.tone) == ("idle", "proof passed", "good")
     # A given amplitude is not searched for between the limits of the command.
     loop.options.amplitude, loop.options.at = 1.0, 2.0
     assert loop.answers.lacking(loop.form) == []
+
+
+def test_a_plan_that_relay_node_refuses_marks_the_answer_to_change() -> None:
+    def one_way() -> None:
+        raise NotReadyError(Code.ONE_WAY(baseline=5.0, where="at", limit="command_max", value=5.0))
+
+    found = Checklist()
+    # a note asks for nothing
+    found.tell("limits", Code.NO_LIMITS(missing="measurement_min", limit="measurement_min"))
+    found.do("levels", one_way, str)
+    client: Any = Looker(measures=44.0)
+    client.name, client.succeeded, client.not_ready_yet = "/relay_node", False, False
+    answer = answer_of(found, accepted=False)
+    client.set_values, client.check = lambda node, values: None, lambda amplitude: answer
+    given = ("--at", "5", "--within", "30", "50", "--command-within", "0", "5")
+    loop = TopicLoop(client, options("--web", *given))
+    shown: Any = _LoopOnPage.__new__(_LoopOnPage)
+    shown._loop, shown._client, shown._options = loop, client, loop.options
+    shown._live = Live("tank")
+    shown._show_plan(PageCommand("start", dry=7))
+    plan = shown._live.told.plan
+    assert plan.refusal.startswith("refused: ") and plan.refused == "at"
+    assert [line[:2] for line in plan.lines] == [("note", "limits"), ("NO", "levels")]
 
 
 def test_a_form_that_can_be_goes_to_relay_node_as_numbers() -> None:

@@ -249,22 +249,22 @@ def test_the_step_that_proves_is_clear_of_the_noise_and_within_limits(
     noise = noise_of(0.5 * noise_std, noise_std)
     assert noise == noise_of(noise_std, math.nan) == noise_std
     commands = Limits(0.0, command_high)
-    assert StepChoice(record, model, room, commands, noise).best == height
+    assert StepChoice(record, model, Control(GAINS), room, commands, noise).best == height
     # Without room on either side it goes as far as it can.
-    tight = StepChoice(record, model, Limits(39.9, 40.1), commands, noise).best
+    tight = StepChoice(record, model, Control(GAINS), Limits(39.9, 40.1), commands, noise).best
     assert abs(tight) == pytest.approx(0.08)
 
 
 def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
     record = Record(
-        time=np.arange(401.0), measurement=np.full(401, 40.0), command=np.full(401, 2.0),
+        time=0.01 * np.arange(401.0), measurement=np.full(401, 40.0), command=np.full(401, 2.0),
         settings=RelaySettings(40.0, 2.0, 1.0), noise_std=0.02, cycle_start=(0, 200, 400),
     )  # fmt: skip
     model, gains = TransferFunction.fopdt(1.65, 1.0, 0.5), Controller(kc=0.9, ti=0.9)
     wanted = plan(Control(gains), model, Step(setpoint=1.0), 0.01)
     assert 1.1 < wanted.peak < 2.0
-    choice = StepChoice(record, model, Limits(30.0, 42.0), Limits(0.0, 5.0), 0.02)
-    allowed = choice.allowed(wanted)
+    choice = StepChoice(record, model, Control(gains), Limits(30.0, 42.0), Limits(0.0, 5.0), 0.02)
+    allowed = choice.allowed
     low, high = allowed.low, allowed.high
     assert allowed.least == rounded_up(0.02 * wanted.visible) == pytest.approx(0.15, abs=0.04)
     # The command holds down to 3.3 below; the peak of the next step of two digits is too high.
@@ -273,8 +273,13 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
         plan(Control(gains), model, Step(setpoint=h), 0.01).peak for h in (high, high + 0.1)
     ]
     assert at_peak[0] < 2.0 - 3.0 * 0.02 < at_peak[1]
+    # a step down is no other plan than one up, upside down
+    down = plan(Control(gains), model, Step(setpoint=-0.7), 0.01).command
+    assert choice.expected(-0.7) == f"from {2.0 + down[0]:.3g} to {2.0 + down[1]:.3g} u"
     peak = replace(wanted, peak=1.2, visible=0.0)
-    narrow = replace(choice, measurement=Limits(39.9, 40.05)).allowed(peak)
+    near = replace(choice, measurement=Limits(39.9, 40.05))
+    vars(near)["_plan"] = peak
+    narrow = near.allowed
     assert narrow == StepRange(-0.033, 0.0)
     narrow.require(-0.03)
     for wrong in (0.01, 0.0, -0.04, math.nan):

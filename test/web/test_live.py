@@ -20,7 +20,7 @@ from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import ultimate_of
 from relay_autotune.web import live as live_module
 from relay_autotune.web import wire
-from relay_autotune.web.live import Live, PageCommand
+from relay_autotune.web.live import Live, PageCommand, PagePlan
 from relay_autotune.web.wire import of_running
 
 
@@ -152,6 +152,8 @@ def test_a_whole_number_is_a_step():
         {"do": "start", "settings": {"at": "2"}},
         {"do": "start", "settings": {"within": [1, None]}},
         {"do": "start", "settings": 7},
+        {"do": "prove", "dry": "1"},
+        {"do": "prove", "dry": -1},
     ],
 )
 def test_an_impossible_wish_ends_the_connection(wish):
@@ -204,15 +206,18 @@ def test_nobody_who_looks_does_not_make_what_is_new_grow(monkeypatch):
 @pytest.mark.browser
 def test_the_page_of_a_loop_with_hostile_texts(tmp_path):
     live = Live(HOSTILE)
-    live.tell(
-        status=HOSTILE, checks=((HOSTILE, HOSTILE, HOSTILE),), cycles=(HOSTILE,), result=(HOSTILE,)
-    )
+    live.tell(status=HOSTILE, cycles=(HOSTILE,), result=(HOSTILE,))
     with served([], live=live) as url, Chromium(tmp_path) as browser:
         tab = browser.tab(url)
         tab.wait("document.body.dataset.phase === 'idle'")
         assert tab.text("#name") == HOSTILE
         assert tab.text("#live-status") == HOSTILE
-        assert tab.eval("document.querySelectorAll('img, main script').length") == 0
+        tab.click("#start")
+        asked = tab.until(live.next_wish, "the wish")
+        live.tell(plan=PagePlan(asked.dry, HOSTILE, HOSTILE, ((HOSTILE, HOSTILE, HOSTILE),)))
+        tab.wait("document.querySelector('#plan-lines li')")
+        assert tab.text("#plan-said") == HOSTILE
+        assert tab.eval("document.querySelectorAll('img, main script, dialog script').length") == 0
         assert tab.eval("document.title") == f"{HOSTILE} - relay_autotune"
         assert tab.said == []
 
@@ -273,7 +278,7 @@ def test_abort_is_in_reach_while_a_tune_runs_and_its_model_can_be_shaped_then(tm
         tab.wait("document.querySelectorAll('#plot-live-measurement path.line').length === 3")
         tab.click("#abort")
         tab.until(live.abort.is_set, "the wish")
-        live.tell(phase="idle", accepted=False)
+        live.tell(phase="idle")
         tab.wait("document.querySelector('#abort').disabled")
         assert tab.eval("document.querySelector('#start').checkVisibility()")
         assert tab.said == []
@@ -282,7 +287,7 @@ def test_abort_is_in_reach_while_a_tune_runs_and_its_model_can_be_shaped_then(tm
 @pytest.mark.browser
 def test_on_a_phone_a_wish_shows_what_comes_of_it_and_a_model_stands_once(tmp_path):
     live = Live("/relay_node")
-    live.tell(proves=True, step=0.5, process="1 / (1 + s)")
+    live.tell(proves=True, process="1 / (1 + s)")
     curve = [[0.0, 1.0], [0.0, 1.0]]
     step = {"name": "set-point step", "passed": True, "measurement": curve, "predicted": curve}
     live.show("proof", [step])
@@ -298,22 +303,34 @@ def test_on_a_phone_a_wish_shows_what_comes_of_it_and_a_model_stands_once(tmp_pa
         assert not tab.eval("document.querySelector('#live-process').checkVisibility()")
         # nothing moves under the pointer any more
         tab.wait("document.body.dataset.settled === 'yes'")
-        # what it would do is asked first, and a step that cannot be made ends there
+        # what it would do is asked first; a step that cannot be made is changed where it stands
         tab.click("#prove")
-        assert tab.until(live.next_wish, "the wish").dry
-        live.tell(planned=1, refusal="the step is 9 y, expected from -3 to 4 y")
-        tab.wait(
-            "document.querySelector('#force-new').innerText.includes('expected from -3 to 4 y')"
-        )
-        assert not tab.eval("document.querySelector('#question').open")
-        tab.click("#prove")
-        assert tab.until(live.next_wish, "the wish").dry
-        live.tell(planned=2, refusal="", plan="The valve is expected from 46 to 58 u, for 2 min.")
-        tab.wait("document.querySelector('#question').open")
-        assert "from 46 to 58 u, for 2 min" in tab.text("#question-text")
+        asked = tab.until(live.next_wish, "the wish")
+        assert asked.step == 0.0
+        form = {"name": "step", "question": "step of the set-point", "unit": "y", "ends": 1,
+                "values": [9.0], "now": "", "needed": True}  # fmt: skip
+        live.tell(status="before", plan=PagePlan(asked.dry, "9 y, expected -3 to 4 y", "step", (),
+                                                 (form,)))  # fmt: skip
+        tab.wait("document.querySelector('#form-step-0')?.ariaInvalid === 'true'")
+        assert tab.text("#plan-said") == "9 y, expected -3 to 4 y"
+        assert tab.eval("document.activeElement.id") == "form-step-0"
+        assert tab.eval("document.querySelector('#plan-yes').disabled")
+        tab.eval("document.activeElement.value = ''; 0")
+        tab.call("Input.insertText", text="2")
+        asked = tab.until(live.next_wish, "the wish")
+        assert asked.dry and asked.step == 2.0
+        expected = "The valve is expected from 46 to 58 u, for 2 min."
+        live.tell(plan=PagePlan(asked.dry, lines=(("", "expected", expected),), form=(form,)))
+        tab.wait("!document.querySelector('#plan-yes').disabled")
+        assert expected in tab.text("#plan-lines")
+        assert tab.eval("document.querySelector('#form-step-0').value") == "2"
+        assert not tab.eval("document.querySelector('[aria-invalid]')")
+        # after Cancel nothing stands there of what was refused
+        assert tab.text("#live-status") == "before"
         tab.eval("scrollTo(0, document.body.scrollHeight)")
-        tab.click("#question-yes")
-        assert not tab.until(live.next_wish, "the wish").dry
+        tab.click("#plan-yes")
+        wish = tab.until(live.next_wish, "the wish")
+        assert (wish.dry, wish.step) == (0, 2.0)
         assert tab.eval("scrollY") == 0
         # the figure of a proof does not stand beside the gains of the next tune
         live.tell(phase="tuning", proof=())
@@ -425,7 +442,7 @@ def test_what_is_wished_goes_to_the_loop_that_is_meant():
 @pytest.mark.browser
 def test_each_loop_has_a_tab_and_every_one_that_runs_can_be_ended(tmp_path):
     lives = [Live("/tank/relay_node"), Live("/oven/relay_node")]
-    lives[0].tell(controller="/tank/controller_node", present="kc 1 u/y", step=0.5)
+    lives[0].tell(controller="/tank/controller_node", present="kc 1 u/y")
     subject = subject_of(analysed())
     subject.loop = 1
     with served([subject], lives=lives) as url, Chromium(tmp_path) as browser:
@@ -433,12 +450,12 @@ def test_each_loop_has_a_tab_and_every_one_that_runs_can_be_ended(tmp_path):
         tab.wait("document.querySelectorAll('#loops button').length === 2")
         assert tab.text("#name") == "/tank/relay_node"
         assert not tab.text("#gains")
-        # gains of another loop are not offered, and a question makes way for a tune
+        # gains of another loop are not offered, and a plan makes way for a tune
         assert tab.eval("document.querySelector('#apply').disabled")
         tab.click("#verify")
-        tab.wait("document.querySelector('#question').open")
+        tab.wait("document.querySelector('#plan').open")
         lives[1].tell(phase="tuning", state="relay", status="at the high level")
-        tab.wait("!document.querySelector('#question').open")
+        tab.wait("!document.querySelector('#plan').open")
         tab.click("#loops .stop")
         tab.until(lives[1].abort.is_set, "the end of the other loop")
         assert not lives[0].abort.is_set()

@@ -28,31 +28,6 @@ export function table(host, rows, cells) {
   host.replaceChildren(...(host.tagName === "TBODY" ? body.children : [body]));
 }
 
-// Lines of a checklist that say what a tune will do.
-const PLAN = ["moves", "within", "switches", "holds", "levels", "limits", "at rest", "expected", "time"];
-const MARKS = { ok: ["\u2713", "good"], note: ["!", "warn"], NO: ["\u2715", "bad"] };
-
-function checklist(host, checks) {
-  host.replaceChildren(...checks.map(([mark, name, found]) => {
-    const [sign, tone] = MARKS[mark] || [mark, ""];
-    const line = document.createElement("li");
-    line.className = tone;
-    for (const [kind, text] of [["mark", sign], ["name", name], ["found", found]]) {
-      const part = document.createElement("span");
-      part.className = kind;
-      part.textContent = text;
-      line.append(part);
-    }
-    return line;
-  }));
-}
-
-// How many of some checks have passed.
-function sum(checks) {
-  const passed = checks.filter(([mark]) => mark === "ok").length;
-  return `Checklist: ${passed} of ${checks.length} checks passed`;
-}
-
 function texts(host, name, lines) {
   if (host.children.length === lines.length) return;
   host.replaceChildren(...lines.map((line) => {
@@ -92,9 +67,6 @@ class Signal {
   get curve() { return { x: this.times.subarray(0, this.count), y: this.values.subarray(0, this.count) }; }
 }
 
-// Time without a key after which what was typed is looked at [ms].
-const TYPED = 500;
-
 // Time that is shown while no tune has run [s].
 const LAST = 60;
 
@@ -126,7 +98,6 @@ class Loop {
     this.number = number;
     this.told = null;
     this.shown = {};
-    this.planned = 0; // number of the check that says how a tune with the form's settings goes
     this.signals = { measurement: new Signal(), command: new Signal() };
   }
 
@@ -150,46 +121,31 @@ class Loop {
 }
 
 export class Live {
-  // wish: sends a wish; agreed: asks a question and resolves to the answer; offered: returns the
-  // gains that the page shows, as {wish, words, doubtful}; null: it shows none; chosen: called
-  // when another loop is shown
-  constructor(wish, agreed, offered, chosen) {
+  // wish: sends a wish; plan: the dialog; offered: returns the gains that the page shows, as
+  // {wish, words, doubtful}; null: it shows none; chosen: called when another loop is shown
+  constructor(wish, plan, offered, chosen) {
     this.wish = wish;
-    this.agreed = agreed;
+    this.plan = plan;
+    this.question = 0; // number of what the plan waits for; 0: nothing
     this.offered = offered;
     this.chosen = chosen;
     this.loops = [];
     this.loop = null; // the one that is shown
     this.drawn = false; // just now
     this.stale = false; // samples came since it was drawn
-    const send = (what) => this.send(what);
     this.plots = {
       measurement: new Plot($("plot-live-measurement"), { label: "Measurement as it comes", y: "measurement [y]" }),
       command: new Plot($("plot-live-command"), { label: "Command as it comes", x: "time [s]", y: "command [u]" }),
     };
-    $("check").addEventListener("click", () => send("check"));
-    $("start").addEventListener("click", () => this.openPlan());
-    $("plan-check").addEventListener("click", () => this.checkPlan());
-    $("plan-start").addEventListener("click", () => this.startPlan());
-    $("plan-leave").addEventListener("click", () => $("plan").close());
-    $("form").addEventListener("input", () => {
-      $("plan-start").disabled = true;
-      clearTimeout(this.typing);
-      this.typing = setTimeout(() => this.checkPlan(), TYPED);
-    });
-    $("form").addEventListener("submit", (event) => event.preventDefault());
-    $("abort").addEventListener("click", () => send("abort"));
+    $("start").addEventListener("click", () => this.begin("start", `Tune ${this.told.node}`, "Start the tune"));
+    $("abort").addEventListener("click", () => this.send("abort"));
     this.model = new Plot($("plot-so-far"), { label: "Measurement so far, and the model", x: "time [s]", y: "measurement [y]" });
     this.ultimate = new Plot($("plot-ku"), { label: "K_u after each cycle with its 95 % interval", x: "cycles", y: "K_u [u/y]" });
     this.proof = new Plot($("plot-proof"), { label: "Verification: measured and predicted", x: "time [s]", y: "measurement [y]" });
-    $("prove").addEventListener("click", () => this.prove(Number($("step").value)));
-    $("apply").addEventListener("click", () => this.apply(Number($("step").value)));
-    $("apply-only").addEventListener("click", () => this.apply(0));
-    $("verify").addEventListener("click", () => this.verify(Number($("step").value)));
-    $("revert").addEventListener("click", () => this.revert());
-    this.said = ""; // what the page waits for, or why the step cannot be made
-    $("step").addEventListener("input", () => { this.said = ""; this.showForce(); });
-    this.planned = () => {}; // called with what is known once it is said what a proof would do
+    $("prove").addEventListener("click", () => this.begin("prove", "Prove the gains", this.told.controller ? "Apply and verify" : "Prove the gains"));
+    $("apply").addEventListener("click", () => this.begin("apply", "Apply without a step", "Apply"));
+    $("verify").addEventListener("click", () => this.begin("verify", "Verify the gains in force", "Verify"));
+    $("revert").addEventListener("click", () => this.begin("revert", "Return to the earlier gains", "Return to them"));
     document.addEventListener("visibilitychange", () => this.drawSoon());
   }
 
@@ -199,7 +155,7 @@ export class Live {
 
   send(what, more, loop = this.loop) {
     // What comes of it is told at the top.
-    if (what !== "check") window.scrollTo(0, 0);
+    window.scrollTo(0, 0);
     this.wish(what, { loop: loop.number, ...more });
   }
 
@@ -213,13 +169,9 @@ export class Live {
       const before = loop.told;
       loop.told = message.live;
       this.showLoops();
-      // A question must not stand before what ends a tune.
-      if (loop.running && !(before && before.phase === loop.phase)) {
-        if ($("question").open) $("question-no").click();
-        if ($("plan").open) $("plan").close();
-      }
+      // A plan must not stand before what ends a tune.
+      if (loop.running && !(before && before.phase === loop.phase)) this.plan.close();
       if (loop === this.loop) this.show(before);
-      if (before && before.planned < loop.told.planned) this.planned(loop.told);
     }
     if (loop !== this.loop) return;
     const { proof, model } = message.shown || {};
@@ -332,7 +284,7 @@ export class Live {
     $("live-status").textContent = told.status;
     $("abort").disabled = !this.loop.running;
     $("abort").textContent = told.phase === "verifying" ? "End the verification" : "Abort the tune";
-    $("check").disabled = $("start").disabled = told.phase !== "idle";
+    $("start").disabled = told.phase !== "idle";
     $("start").parentElement.hidden = this.loop.running;
     $("abort").hidden = !this.loop.running;
     $("progress").hidden = !tuning;
@@ -342,10 +294,6 @@ export class Live {
     if (before && before.cycles.length > told.cycles.length) $("live-cycles").replaceChildren();
     texts($("live-cycles"), "li", told.cycles);
     $("live-process").textContent = told.process;
-    $("checks-box").hidden = !told.checks.length;
-    $("checks-sum").textContent = sum(told.checks);
-    if (!told.accepted && told.checks.length && !(before && before.checks.length)) $("checks-box").open = true;
-    checklist($("live-checks"), told.checks);
     this.showPlan();
     $("result-box").hidden = !told.result.length;
     $("live-result").textContent = told.result.join("\n");
@@ -353,9 +301,8 @@ export class Live {
     const runs = Boolean(told.controller);
     $("force").hidden = tuning || !(runs || told.proves);
     $("force-title").textContent = runs ? "The running controller" : "Prove the gains";
-    for (const id of ["apply", "apply-only", "verify", "revert"]) $(id).hidden = !runs;
-    $("prove").hidden = runs;
-    if (told.step !== null && (!before || before.step !== told.step)) $("step").value = told.step;
+    for (const id of ["apply", "verify", "revert"]) $(id).hidden = !runs;
+    $("prove").textContent = runs ? "Apply and verify" : "Prove with a step";
     table($("force-proof"), told.proof, ["", "text"]);
     // The figure of a proof goes with its words: other gains have come since.
     $("proof").hidden = !(told.proof.length && (this.loop.shown.proof || []).length);
@@ -368,15 +315,9 @@ export class Live {
     const { controller, present, phase } = this.told;
     const new_ = this.offered();
     $("force-now").textContent = controller ? `${controller} has ${present}` : "Nobody controls this loop: a controller of this command makes one step, and ends.";
-    $("force-new").textContent = this.said || (new_ ? `${controller ? "To apply" : "To prove"}: ${new_.words}${new_.doubtful ? ", which are doubtful" : ""}.` : "The page shows no gains that could be applied.");
-    $("steps-allowed").textContent = this.told.steps;
-    const idle = phase === "idle";
-    const step = Number($("step").value);
-    const moves = Number.isFinite(step) && step !== 0;
-    $("prove").disabled = $("apply").disabled = !(idle && new_ && moves);
-    $("apply-only").disabled = !(idle && new_);
-    $("verify").disabled = !(idle && moves);
-    $("revert").disabled = !idle;
+    $("force-new").textContent = new_ ? `${controller ? "To apply" : "To prove"}: ${new_.words}${new_.doubtful ? ", which are doubtful" : ""}.` : "The page shows no gains that could be applied.";
+    $("prove").disabled = $("apply").disabled = !(phase === "idle" && new_);
+    $("verify").disabled = $("revert").disabled = phase !== "idle";
   }
 
   // The newest model of the running tune; null: there is none yet.
@@ -411,117 +352,28 @@ export class Live {
     });
   }
 
-  stepWords(step) {
-    return `Its set-point then steps by ${step} y and back, once the loop is at rest. If the loop does not do what the model predicts, the gains before come back by themselves.`;
-  }
-
-  async apply(step) {
-    const new_ = this.offered();
-    if (!new_) return;
-    const { loop, told: { controller, present } } = this;
-    if (new_.doubtful && !(await this.agreed(`These gains are doubtful: ${new_.doubtful}`, "Take them all the same"))) return;
-    const then = step ? this.stepWords(step) : "They are not verified.";
-    const what = `${controller} has ${present}. At once it gets ${new_.words}, without a bump of the command. ${then}`;
-    if (await this.agreed(what, step ? "Apply and verify" : "Apply")) {
-      this.send("apply", { ...new_.wish, step, accept_doubtful: Boolean(new_.doubtful) }, loop);
-    }
-  }
-
-  async verify(step) {
-    const { loop, told: { controller, present } } = this;
-    if (await this.agreed(`${controller} keeps ${present}. ${this.stepWords(step)}`, "Verify")) this.send("verify", { step }, loop);
-  }
-
-  async revert() {
-    const { loop, told: { controller, present } } = this;
-    const what = `${controller} has ${present}. At once it gets the gains that it had before, without a bump of the command.`;
-    if (await this.agreed(what, "Return to them")) this.send("revert", {}, loop);
-  }
-
-  async prove(step) {
-    const new_ = this.offered();
-    if (!new_) return;
+  // Have the server say what a wish would do, and send it once that is agreed to.
+  begin(what, title, yes) {
     const { loop } = this;
-    if (new_.doubtful && !(await this.agreed(`These gains are doubtful: ${new_.doubtful}`, "Take them all the same"))) return;
-    const wish = { ...new_.wish, step, accept_doubtful: Boolean(new_.doubtful) };
-    const said = new Promise((resolve) => { this.planned = resolve; });
-    this.said = "computing what the step will do";
-    this.showForce();
-    this.wish("prove", { loop: loop.number, ...wish, dry: true });
-    const { plan, refusal } = await said;
-    this.said = refusal && `It cannot be made: ${refusal}`;
-    this.showForce();
-    if (!refusal && await this.agreed(`Gains: ${new_.words}. ${plan}`, "Prove the gains")) this.send("prove", wish, loop);
+    const gains = what === "prove" || what === "apply" ? this.offered() : null;
+    const doubtful = Boolean(gains && gains.doubtful);
+    const words = (typed) => ({ ...(gains && gains.wish), accept_doubtful: doubtful, ...(what === "start" ? { settings: typed } : typed) });
+    this.question = 0;
+    this.plan.begin(title, yes + (doubtful ? ", though they are doubtful" : ""), (typed) => this.send(what, words(typed), loop), (typed) => {
+      this.question = 1 + Math.floor(Math.random() * 2 ** 52);
+      this.seen = this.told.plan.number;
+      // What is looked at now is of other answers, or of another page.
+      this.again = this.told.phase !== "idle";
+      if (!this.again) this.wish(what, { loop: loop.number, ...words(typed), dry: this.question });
+    });
   }
 
-  // The settings of the form; null: one of them is missing.
-  settings() {
-    const found = {};
-    for (const { name, needed } of this.told.form) {
-      const typed = [...document.querySelectorAll(`#form input[name=${name}]`)].map((input) => input.value.trim());
-      if (!needed && typed.every((text) => text === "")) continue;
-      if (typed.some((text) => text === "" || !Number.isFinite(Number(text)))) return null;
-      const numbers = typed.map(Number);
-      found[name] = numbers.length > 1 ? numbers : numbers[0];
-    }
-    return found;
-  }
-
-  openPlan() {
-    const { node, form } = this.told;
-    $("plan-title").textContent = `Tune ${node}`;
-    $("form").replaceChildren();
-    for (const { name, question, unit, values, ends, now, needed } of form) {
-      const row = document.createElement("div");
-      const label = document.createElement("label");
-      label.textContent = `${question} [${unit}]`;
-      row.append(label);
-      const fields = document.createElement("span");
-      for (let k = 0; k < ends; k += 1) {
-        const input = document.createElement("input");
-        Object.assign(input, { name, type: "number", step: "any", value: values && values[k] !== null ? values[k] : "" });
-        if (!needed) input.placeholder = "as it is";
-        input.id = `form-${name}-${k}`;
-        if (k === 0) label.htmlFor = input.id;
-        else input.setAttribute("aria-label", `${question}, upper end`);
-        fields.append(input);
-      }
-      if (now) fields.append(now);
-      row.append(fields);
-      $("form").append(row);
-    }
-    $("plan").showModal();
-    this.loop.planned = 0;
-    this.checkPlan();
-  }
-
-  checkPlan() {
-    if (!$("plan").open) return;
-    const settings = this.settings();
-    $("plan-start").disabled = true;
-    // A check that runs is of other settings.
-    this.again = this.told.phase !== "idle" || this.told.checked < this.loop.planned;
-    if (this.again) return;
-    this.loop.planned = 0;
-    if (!settings) { $("plan-said").textContent = "Fill in all of them: nothing moves before you start the tune."; $("plan-lines").replaceChildren(); return; }
-    this.loop.planned = this.told.checked + 1;
-    $("plan-said").textContent = "looking at the loop";
-    this.send("check", { settings });
-  }
-
-  // What a tune with the settings of the form will do, or why it cannot start.
   showPlan() {
-    const { told, loop } = this;
-    if (!$("plan").open || !loop.planned || told.checked < loop.planned) return;
-    if (this.again) { this.checkPlan(); return; }
-    $("plan-start").disabled = !told.accepted || told.phase !== "idle";
-    $("plan-check").hidden = told.accepted;
-    $("plan-said").textContent = told.accepted ? "Nothing moves before you start the tune; it can be aborted at any time." : told.status;
-    checklist($("plan-lines"), told.checks.filter(([mark, name]) => mark !== "ok" || PLAN.includes(name)));
-  }
-
-  startPlan() {
-    this.send("start", { settings: this.settings() });
-    $("plan").close();
+    const { phase, plan } = this.told;
+    if (!this.plan.open || phase !== "idle" || !this.question) return;
+    if (plan.number === this.question) {
+      this.question = 0;
+      this.plan.show(plan);
+    } else if (this.again || plan.number !== this.seen) this.plan.ask();
   }
 }

@@ -5,6 +5,7 @@
 // server is set as text, never as markup.
 
 import { Live, table } from "./live.js";
+import { Plan } from "./plan.js";
 import { Plot, units } from "./plot.js";
 
 const $ = (id) => document.getElementById(id);
@@ -307,27 +308,10 @@ function choose(k) {
 }
 const trades = [];
 
-// Resolves to true if the user agrees to what the question says will happen.
-function agreed(question, yes) {
-  const dialog = $("question");
-  $("question-text").textContent = question;
-  $("question-yes").textContent = yes;
-  dialog.showModal();
-  return new Promise((resolve) => {
-    const end = (answer) => { dialog.close(); resolve(answer); };
-    $("question-yes").onclick = () => end(true);
-    $("question-no").onclick = () => end(false);
-    dialog.oncancel = () => resolve(false);
-  });
-}
-
-async function exportGains(name) {
-  const more = {};
-  if (shaped && shaped.doubtful) {
-    if (!(await agreed(`These gains are doubtful: ${shaped.doubtful}. The file will say so.`, "Write them all the same"))) return;
-    more.accept_doubtful = "yes";
-  }
-  await download(`gains/${name}`, more);
+function exportGains(name) {
+  if (!(shaped && shaped.doubtful)) { download(`gains/${name}`, {}); return; }
+  plan.begin(`Gains for ${name}`, "Write them all the same", () => download(`gains/${name}`, { accept_doubtful: "yes" }));
+  plan.say("The file will say that they are doubtful.", [["note", "doubtful", shaped.doubtful]], true);
 }
 
 async function download(path, more) {
@@ -371,11 +355,12 @@ function showLoop() {
   live.showForce();
 }
 
+const plan = new Plan();
 let live = null; // made when the server has a loop to watch
 
 function take(message) {
   if (message.live || message.samples || message.shown) {
-    live ??= new Live((what, more) => socket.send(JSON.stringify({ do: what, ...more })), agreed, offered, showLoop);
+    live ??= new Live((what, more) => socket.send(JSON.stringify({ do: what, ...more })), plan, offered, showLoop);
     live.take(message);
     if (chosen >= 0) showOf();
     return;
