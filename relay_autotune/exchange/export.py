@@ -106,9 +106,7 @@ def _file(gains: Gains, how: str, target: Target) -> str:
         raise SelectionError(f"the gains are for {runs}: give --law {how} to export them for it")
     if how == OWN_LAW:
         return controller_file(gains, target)
-    law = LAWS[how]
-    written = parameters if law.sets_gains else settings
-    return written(gains, law, target)
+    return settings(gains, LAWS[how], target)
 
 
 def exports_of(law: str) -> tuple[str, ...]:
@@ -129,39 +127,12 @@ def file_name(how: str) -> str:
     return f"{how}.{LAWS[how].ending}" if how in LAWS else _FILES[how]
 
 
-def parameters(gains: Gains, law: ProgramLaw, target: Target) -> str:
-    """Return parameters of a controller of ros2_controllers for one degree of freedom.
-
-    The file holds only one node, since `ros2 param load` applies every section to the node that
-    it is given. Infinite clamps are left out, since they would be read as text.
-
-    :param gains: what is to be loaded.
-    :param law: that it runs.
-    :param target: where they go.
-    """
-    clamps = (("u_clamp_max", target.command_max), ("u_clamp_min", target.command_min))
-    stays = ("antiwindup_strategy",) if target.is_set_up else ()
-    values = [each for each in _values(gains, law) if each[0] not in stays]
-    lines = [
-        *_comments(gains, target, _signed(gains), "#"),
-        f"# ros2 param load {target.node} FILE",
-        f"{_key(target.node)}:",
-        "  ros__parameters:",
-        "    gains:",
-        f"      {_key(target.dof)}:",
-        *(f"        {name}: {value}" for name, value in values[:3]),
-        *(f"        {name}: {number(value)}" for name, value in clamps if math.isfinite(value)),
-        *(f"        {name}: {value}" for name, value in values[3:]),
-    ]
-    return "\n".join(lines) + "\n"
-
-
 def settings(gains: Gains, law: ProgramLaw, target: Target) -> str:
     """Return gains as the settings of a law, a line each, in the words of its program.
 
     :param gains: what they are for.
     :param law: the law.
-    :param target: with the clamps of the command, which become a remark.
+    :param target: where they go.
     """
     low, high = limits = (target.command_min, target.command_max)
     of_command = "" if law.command == "any" else f" Its command is the {law.command}."
@@ -203,8 +174,12 @@ def settings(gains: Gains, law: ProgramLaw, target: Target) -> str:
     if law.sign:
         sign = law.sign.format(sign="positive" if gains.kc < 0.0 else "negative")
         told += (f"{sign}, with kc {gains.kc:.6g}.",)
+    elif law.form == "parallel" and scale * gains.kc < 0.0:
+        told += ("All gains are negative, since a higher command lowers the measurement.",)
     scaled = replace(gains, kc=scale * gains.kc)
     values = list(_values(scaled, law))
+    if target.is_set_up:
+        values = [each for each in values if each[0] != "antiwindup_strategy"]
     if law.bounds is not None:
         values += _texts(law.bounds(*limits))
     if law.start is not None:
@@ -218,7 +193,13 @@ def settings(gains: Gains, law: ProgramLaw, target: Target) -> str:
         if law.start.name and (known or law.start.needs):
             start = law.start.value(law.at(scaled, gains.law_period), present)
             values.append((law.start.name, number(start)))
-    return _written(law, _comments(gains, target, told, law.remark), values)
+    parts = [
+        *_comments(gains, target, told, law.remark),
+        law.head.format(node=_key(target.node), dof=_key(target.dof)),
+        *(law.line.format(name=name, value=value) for name, value in values),
+        law.tail,
+    ]
+    return "\n".join(filter(None, parts)) + "\n"
 
 
 def _full_command(law: ProgramLaw, target: Target) -> float:
@@ -318,12 +299,6 @@ def launch_file(gains: Gains, target: Target) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _written(law: ProgramLaw, comments: list[str], values: Sequence[tuple[str, str]]) -> str:
-    lines = [law.line.format(name=name, value=value) for name, value in values]
-    parts = [*comments, *filter(None, [law.head]), *lines, *filter(None, [law.tail])]
-    return "\n".join(parts) + "\n"
-
-
 def _values(gains: Gains, law: ProgramLaw) -> list[tuple[str, str]]:
     """Return the settings of a law as texts, those without a value left out."""
     at = law.at(gains, gains.law_period)
@@ -411,9 +386,3 @@ def _predicted(gains: Gains, noise_std: float) -> list[str]:
             f"The command has {digits(gains.noise_gain, 3)} u/y times the measurement's noise."
         )
     return found
-
-
-def _signed(gains: Gains) -> list[str]:
-    if gains.kc > 0.0:
-        return []
-    return ["All gains are negative, since a higher command lowers the measurement."]

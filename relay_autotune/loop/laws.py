@@ -77,7 +77,7 @@ class ProgramLaw(Law):
     :param full: its largest command; 0: it may be any.
     :param turned: what to know where a higher command lowers the measurement and its program takes
         that command with the other sign; empty: it takes it as it is.
-    :param head: what stands above its settings.
+    :param head: what stands above its settings, with ``{node}`` and ``{dof}``.
     :param line: how a setting is written, with ``{name}`` and ``{value}``.
     :param tail: what stands below them.
     :param bounds: its settings for the limits of the command, of which each may be infinite;
@@ -174,6 +174,14 @@ def _control_toolbox(
         settings=(*_gains("p i d"), _strategy(strategy), *others),
         integral=integral,
         slope=Slope.ERROR,
+        head="# ros2 param load {node} FILE\n{node}:\n  ros__parameters:\n    gains:\n"
+        "      {dof}:",
+        line="        {name}: {value}",
+        # Infinite ones would be read as text.
+        bounds=lambda low, high: (
+            ("u_clamp_max", _or_none(high)),
+            ("u_clamp_min", _or_none(low)),
+        ),
     )
     return plain, replace(
         plain,

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 from relay_autotune.cli import replay, terminal, tune
 from relay_autotune.errors import ParameterError, SelectionError
-from relay_autotune.exchange.export import Target, exported, number, parameters, plain
+from relay_autotune.exchange.export import Target, exported, number, plain, settings
 from relay_autotune.loop.gains import Gains, Performance
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.process.transfer_function import TransferFunction
@@ -45,7 +45,7 @@ def gains(*values: float, **more: float) -> Gains:
 
 
 def pid_controller(made: Gains, target: Target) -> str:
-    return parameters(made, LAWS["pid_controller"], target)
+    return settings(made, LAWS["pid_controller"], target)
 
 
 def as_loaded(text: str, prefix: str = "") -> dict[str, object]:
