@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from relay_autotune.text import duration
+from relay_autotune.text import counted, duration
 
 Value = float | int | str
 """A fact of a reason."""
@@ -114,7 +114,7 @@ class _Words(string.Formatter):
 
     def format_field(self, value: Any, format_spec: str) -> str:
         if format_spec.startswith("#"):
-            return f"{value} {format_spec[1:]}{'' if value == 1 else 's'}"
+            return counted(value, format_spec[1:])
         if format_spec == "~":
             return duration(value)
         return str(super().format_field(value, format_spec))

@@ -52,6 +52,11 @@ def percent(share: float) -> str:
     return digits(100.0 * share, 2) if not abs(share) < _UNSEEN else "0"
 
 
+def counted(count: int, thing: str) -> str:
+    """Return a number of things, such as "1 sample" and "2 samples"."""
+    return f"{count} {thing}{'' if count == 1 else 's'}"
+
+
 def duration(seconds: float) -> str:
     """Return a duration as text, such as "12 min 5 s"; a dash if it is not finite.
 

@@ -26,7 +26,7 @@ from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Outcome, Record
-from relay_autotune.text import date_text, digits, in_units, percent, plus_minus
+from relay_autotune.text import counted, date_text, digits, in_units, percent, plus_minus
 from relay_autotune.verdict import Judgement, Result, Verdict
 
 if TYPE_CHECKING:
@@ -261,7 +261,7 @@ def _outcome(record: Record) -> str:
 
 
 def _span(record: Record) -> str:
-    text = f"{digits(record.duration)} s, {len(record)} samples"
+    text = f"{digits(record.duration)} s, {counted(len(record), 'sample')}"
     if record.lost_samples:
         text += f", {record.lost_samples} lost"
     if record.start:
@@ -278,14 +278,10 @@ def _limit_cycle(analysis: Analysis) -> list[_Entry]:
         (
             "limit cycle",
             f"period {digits(cycle.period)} s (high {digits(cycle.period_high)} s, "
-            f"low {digits(cycle.period_low)} s), {_count(len(cycle.cycles))}, {state}",
+            f"low {digits(cycle.period_low)} s), {counted(len(cycle.cycles), 'cycle')}, {state}",
         ),
         ("", f"measurement {digits(cycle.peak_min)} to {digits(cycle.peak_max)} y"),
     ]
-
-
-def _count(cycles: int) -> str:
-    return f"{cycles} cycle{'' if cycles == 1 else 's'}"
 
 
 def _identification(found: Identification) -> list[_Entry]:

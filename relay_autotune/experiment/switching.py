@@ -37,7 +37,7 @@ from relay_autotune.experiment.settling import rest_state
 from relay_autotune.reasons import Code, Reason, Value
 from relay_autotune.record.cycles import MIN_CYCLES, cycle_from_samples, next_cycle
 from relay_autotune.record.record import Cycle
-from relay_autotune.text import duration
+from relay_autotune.text import counted, duration
 
 # Two instants that differ by less than this part of the sample interval are equal.
 _ROUNDING = 1e-6
@@ -220,7 +220,7 @@ class Switching:
     def where(self) -> str:
         """The state as the end of a sentence."""
         n = len(self.cycles)
-        return f"after {n} whole cycle{'' if n == 1 else 's'}"
+        return f"after {counted(n, 'whole cycle')}"
 
     @property
     def is_tried(self) -> bool:

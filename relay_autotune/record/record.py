@@ -19,6 +19,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import RecordError
 from relay_autotune.quantities import LARGEST, result_field
 from relay_autotune.reasons import NONE, Reason
+from relay_autotune.text import counted
 
 # Difference of equal slopes, relative to the steepest one.
 _STRAIGHT = 1e-12
@@ -404,7 +405,7 @@ class Record:
         how = (
             "recorded elsewhere" if self.outcome is Outcome.UNKNOWN else self.outcome.name.lower()
         )
-        return f"<Record{name}: {len(self)} samples over {self.duration:.4g} s, {how}>"
+        return f"<Record{name}: {counted(len(self), 'sample')} over {self.duration:.4g} s, {how}>"
 
     @property
     def duration(self) -> float:

@@ -13,7 +13,7 @@ from relay_autotune.loop.analysis import difference, performance_beside
 from relay_autotune.loop.gains import Controller, Performance
 from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import Case
-from relay_autotune.text import date_text, digits, percent
+from relay_autotune.text import counted, date_text, digits, percent
 from relay_autotune.verdict import Finding, Result, Verdict
 
 Tone = Literal["good", "warn", "bad"]
@@ -121,7 +121,7 @@ def facts_of(case: Case, *, with_id: bool) -> tuple[str, ...]:
         found.append(date_text(case.start))
     length = f"{digits(case.duration)} s"
     if case.samples:
-        length += f", {case.samples} samples"
+        length += f", {counted(case.samples, 'sample')}"
         if case.lost_samples:
             length += f", {case.lost_samples} lost"
     return (*found, length)

@@ -226,7 +226,8 @@ def test_whether_a_slow_process_integrates_is_said_to_be_open():
         (np.arange(100.0), np.zeros(100), "command never changes"),
         (np.full(100, 7.0), np.arange(100) // 50 * 1.0, "constant at 7"),
         (np.arange(100) // 20 % 2 * 5.0, np.sin(np.arange(100)), "the wrong way round"),
-        (np.arange(8.0), np.arange(8) // 4 * 1.0, "8 samples"),
+        (np.arange(8.0), np.arange(8) // 4 * 1.0, "holds 8 samples; a fit"),
+        (np.zeros(1), np.zeros(1), "holds 1 sample; a fit"),
     ],
 )
 def test_data_that_tell_nothing_are_refused_with_the_reason(measurement, command, said):

@@ -52,6 +52,7 @@ from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, TABLE
 from relay_autotune.record.excitation import at_its_ends, changes_within, smooth
 from relay_autotune.record.record import Input, PiecewiseConstant, Record, roughness
+from relay_autotune.text import counted
 
 # Number of samples from which even a coarse measurement takes more than two values, and how many
 # times as often as it the command moves where the two are exchanged: in 90 recordings of plants
@@ -339,8 +340,8 @@ def _require_content(record: Record, u: Input) -> None:
     time, y = record.time, record.measurement
     if y.size < _LEAST_SAMPLES:
         raise IdentificationError(
-            f"the record holds {y.size} samples; a fit needs at least {_LEAST_SAMPLES}: "
-            "record longer"
+            f"the record holds {counted(y.size, 'sample')}; a fit needs at least "
+            f"{_LEAST_SAMPLES}: record longer"
         )
     if not np.ptp(time) > 0.0:
         raise IdentificationError("all samples of the record have the same time")
