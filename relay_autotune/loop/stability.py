@@ -3,8 +3,8 @@
 
 """Stability of a closed loop and its margins: gain, phase, delay, peaks of the sensitivities.
 
-The number of poles in the right half plane comes from an exact argument principle; of a sampled
-loop, that of the poles outside the unit circle from its phase along the circle.
+The number of poles in the right half plane comes from the argument principle, and so does that of
+the poles of a sampled loop outside the unit circle.
 
 The characteristic equation is ``1 + sum L_k(s) = 0``, each L_k rational with a dead time of its
 own. Where they have n poles at s = 0, all is multiplied by ``(a s/(1 + a s))^n``; the function H
@@ -13,15 +13,14 @@ zeros in the right half plane are those of the closed loop, and
 
     zeros = poles - (turning of H from w = 0 to infinity)/pi.
 
-The turning of H is not read from a grid: the axis is divided until, on every piece, a bound on
-``|H'|`` times the length of the piece is smaller than ``|H|`` at its beginning. So H cannot pass
-around the origin unseen. From the frequency on where H stays nearer to its limit than zero is, it
-cannot turn any more. There a loop of moderate Ms is before its dead time turns often, since one
-that turns at a magnitude near 1 passes -1. So the few pieces of every usable loop are known, and a
-loop that needs far more counts as one with infinitely many zeros: it cannot be told, and nobody
-wants it. A loop of neutral type, whose L_k with dead time do not vanish at infinity,
-is stable only if their magnitudes there have a sum below that of the rest (Bellman and Cooke
-1963).
+The phase of H is followed over a grid that shows corners, resonances and the turns of each dead
+time. A cell in which it turns by more than a radian, or a dead time does, is divided, unless the
+L_k are so small at both ends that H is nearer to its limit than zero is, whatever their phases:
+there it turns around nothing. A loop of moderate Ms is that near before its dead time turns often,
+since one that turns at a magnitude near 1 passes -1. So few cells are divided of every usable
+loop, and a loop that needs far more counts as one with infinitely many zeros: it cannot be told,
+and nobody wants it. A loop of neutral type, whose L_k with dead time do not vanish at infinity, is
+stable only if their magnitudes there have a sum below that of the rest (Bellman and Cooke 1963).
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ import math
 import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
@@ -42,16 +40,14 @@ from relay_autotune.loop.gains import Margins
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.scalar import roots
 
-_PIECES = 128
-_BRANCH_PARTS = 4
-# If a piece becomes this short, H passes through zero within the accuracy of the numbers.
-_SHORTEST = 1e-12
-# Stable loops take up to 1,100 pieces, those of which the tests know the zeros up to 3,600.
+# A loop whose phase has to be followed in more cells at once cannot be told.
 MOST_PIECES = 20_000
+# Part of the distance of the limit of H from zero, within which H turns around nothing.
 _SURE = 0.9
+# H begins where it is this near to its limit for w -> 0, relative to that.
+_AT_REST = 0.1
 # Tangent of a phase step that is small enough to be unambiguous.
 _CLEAR = math.tan(1.0)
-_COMPLEX_FACTOR = math.sqrt(0.75)
 
 
 def closed_loop_unstable_poles(terms: Sequence[TransferFunction]) -> float:
@@ -72,8 +68,39 @@ def closed_loop_unstable_poles(terms: Sequence[TransferFunction]) -> float:
     # Those that several terms share count once.
     unstable = [Counter(t for t in term.time_constants if t.real < 0.0) for term in terms]
     poles = reduce(operator.or_, unstable).total()
-    turns = _turning(terms, 1.0 + at_once, later + _SURE * (abs(1.0 + at_once) - later))
-    return math.inf if turns is None else poles - round(turns / math.pi)
+    limit, n = 1.0 + at_once, max(0, *(t.integrators for t in terms))
+    near = later + _SURE * (abs(limit) - later)
+    grid = frequencies(*terms)
+    a = 1.0 / math.sqrt(grid[0] * grid[-1])
+
+    def bounded(w: FloatArray) -> ComplexArray:
+        s = 1j * w
+        return np.asarray((1.0 + sum(t(s) for t in terms)) * (a * s / (1.0 + a * s)) ** float(n))
+
+    def is_near(w: FloatArray) -> NDArray[np.bool_]:
+        rests = (
+            np.abs(t(1j * w) - (0.0 if t.dead_time else g))
+            for g, t in zip(limits, terms, strict=True)
+        )
+        return np.asarray(sum(rests) < near)
+
+    begin = a**n * sum(t.gain for t in terms if t.integrators == n) + (n == 0)
+    low, high = grid[:1], grid[-1:]
+    while abs(bounded(low)[0] - begin) > _AT_REST * abs(begin):
+        low = 0.1 * low
+        if low[0] < _LOWEST:
+            return math.inf
+    while not is_near(high)[0]:
+        high = 2.0 * high
+    ends = [
+        np.geomspace(x, y, 2 + int(_PER_DECADE * math.log10(y / x)))
+        for x, y in ((low[0], grid[0]), (grid[-1], high[0]))
+    ]
+    grid = np.unique(np.concatenate((grid, *ends)))
+    dead_time = max(t.dead_time for t in terms)
+    turns = _followed(bounded, grid, dead_time, is_near)
+    turns += float(np.angle(bounded(low)[0] / begin) - np.angle(bounded(high)[0] / limit))
+    return math.inf if math.isnan(turns) else poles - round(turns / math.pi)
 
 
 def winding(
@@ -138,24 +165,44 @@ def sampled_unstable_poles(
         rise = 1.0 - np.exp(-1j * w * period)
         return np.asarray((1.0 + loop(1j * w)) * rise ** float(integrators))
 
-    values = bounded(grid)
+    turns = _followed(bounded, grid)
+    return math.inf if math.isnan(turns) else poles - round(turns / math.pi)
+
+
+def _followed(
+    function: Callable[[FloatArray], ComplexArray],
+    grid: FloatArray,
+    dead_time: float = 0.0,
+    is_near: Callable[[FloatArray], NDArray[np.bool_]] | None = None,
+) -> float:
+    """Return by how much the phase of a function grows over a grid [rad]; NaN: it is not clear.
+
+    :param function: of the frequency.
+    :param grid: rad/s, increasing, shape (n,); cells in which the phase turns too far are divided.
+    :param dead_time: the longest in the function [s].
+    :param is_near: whether the function is so near to its limit, with whatever phase of its
+        parts, that it turns around nothing; None: never.
+    """
+    values = function(grid)
     low, high, begins, ends = grid[:-1], grid[1:], values[:-1], values[1:]
     total = 0.0
     for _ in range(_MOST_DIVISIONS):
         with np.errstate(divide="ignore", invalid="ignore"):
             turns = np.angle(ends / begins)
-        clear = np.abs(turns) < _FOLLOWED
+        clear = (np.abs(turns) < _FOLLOWED) & (dead_time * (high - low) < _FOLLOWED)
+        if is_near is not None and not clear.all():
+            clear[~clear] = is_near(low[~clear]) & is_near(high[~clear])
         total += float(turns[clear].sum())
         low, high, begins, ends = low[~clear], high[~clear], begins[~clear], ends[~clear]
         if not low.size:
-            return poles - round(total / math.pi)
+            return total
         if low.size > MOST_PIECES:
             break
         middle = 0.5 * (low + high)
-        between = bounded(middle)
+        between = function(middle)
         low, high = np.concatenate((low, middle)), np.concatenate((middle, high))
         begins, ends = np.concatenate((begins, between)), np.concatenate((between, ends))
-    return math.inf
+    return math.nan
 
 
 def at_infinity(term: TransferFunction) -> float:
@@ -166,129 +213,6 @@ def at_infinity(term: TransferFunction) -> float:
     if excess > 0:
         return math.inf
     return float((term.gain * np.prod(term.zeros) / np.prod(term.time_constants)).real)
-
-
-@dataclass(frozen=True)
-class _Factors:
-    """``gain prod(b + c s)/prod(1 + d s) exp(-D s)``, each b being 0 or 1."""
-
-    gain: float
-    b: FloatArray
-    c: ComplexArray
-    d: ComplexArray
-    dead_time: float
-
-    @classmethod
-    def of(cls, term: TransferFunction, integrators: int, a: float) -> _Factors:
-        """Return ``L (a s/(1 + a s))^n`` for n = ``integrators``."""
-        left = integrators - term.integrators
-        b = np.array([1.0] * len(term.zeros) + [0.0] * left)
-        c = np.array([*term.zeros, *[a] * left], dtype=np.complex128)
-        d = np.array([*term.time_constants, *[a] * integrators], dtype=np.complex128)
-        return cls(term.gain * a**term.integrators, b, c, d, term.dead_time)
-
-    def __call__(self, w: FloatArray) -> ComplexArray:
-        s = 1j * w[:, None]
-        ratio = np.prod(self.b + self.c * s, axis=1) / np.prod(1.0 + self.d * s, axis=1)
-        return np.asarray(self.gain * ratio * np.exp(-1j * self.dead_time * w))
-
-    def steepest(self, low: FloatArray, high: FloatArray) -> FloatArray:
-        """Return a bound on the derivative's magnitude between frequencies, shape (n,)."""
-        _, top = _extent(self.b, self.c, low, high)
-        bottom, _ = _extent(np.ones(self.d.size), self.d, low, high)
-        below = abs(self.gain) / np.prod(bottom, axis=1)
-        by_poles = (np.abs(self.d) / bottom).sum(axis=1) + self.dead_time
-        slope = np.prod(top, axis=1) * by_poles
-        for k in range(self.c.size):
-            slope += abs(self.c[k]) * np.prod(np.delete(top, k, axis=1), axis=1)
-        return np.asarray(slope * below)
-
-    def largest_beyond(self, w: float) -> float:
-        """Return a bound on the magnitude from w on, for w above twice all resonances."""
-        zeros = sorted(zip(np.abs(self.c), self.b, strict=True), reverse=True)
-        bound = abs(self.gain)
-        for k, pole in enumerate(sorted(self.d, key=abs, reverse=True)):
-            c, b = zeros[k] if k < len(zeros) else (0.0, 1.0)
-            top = math.hypot(b, w * c)
-            if pole.imag != 0.0:
-                bound *= top / (_COMPLEX_FACTOR * w * abs(pole))
-            else:
-                bound *= max(top / math.hypot(1.0, w * pole.real), c / abs(pole))
-        return float(bound)
-
-    def change_beyond(self, w: float) -> float:
-        """Return a bound on the distance from the limit from w on, relative to the limit."""
-        bound = 1.0
-        for b, c in zip(self.b, np.abs(self.c), strict=True):
-            bound *= 1.0 + b / (w * c)
-        for d in np.abs(self.d):
-            bound /= max(1.0 - 1.0 / (w * d), 1e-9)
-        return bound - 1.0
-
-
-def _extent(
-    b: FloatArray, c: ComplexArray, low: FloatArray, high: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the least and the largest |b + j w c| between frequencies, shape (n, factors)."""
-    ends = [np.abs(b + 1j * w[:, None] * c) for w in (low, high)]
-    # The square of the magnitude is a parabola in w.
-    turn = np.clip(b * c.imag / np.abs(c) ** 2, low[:, None], high[:, None])
-    return np.abs(b + 1j * turn * c), np.maximum(*ends)
-
-
-def _turning(terms: Sequence[TransferFunction], limit: float, near: float) -> float | None:
-    """Return the growth of the phase of H from w = 0 to infinity; None: it is not certain.
-
-    :param terms: the L_k.
-    :param limit: limit of the part of H without dead time, for w -> infinity.
-    :param near: radius around that limit, without zero, in which H stays in the end.
-    """
-    n = max(term.integrators for term in terms)
-    sizes = [abs(c) for t in terms for c in (*t.zeros, *t.time_constants)]
-    sizes += [t.dead_time for t in terms if t.dead_time > 0.0]
-    a = math.exp(float(np.mean(np.log(sizes)))) if sizes else 1.0
-    one = _Factors.of(TransferFunction(1.0), n, a)
-    parts = [one, *(_Factors.of(t, n, a) for t in terms)]
-    end = _end(parts, near, sizes)
-
-    def value(w: FloatArray) -> ComplexArray:
-        return np.asarray(sum(p(w) for p in parts))
-
-    edges = np.concatenate(([0.0], np.geomspace(1e-9 * min(1.0 / max(sizes), end), end, _PIECES)))
-    low, high = edges[:-1], edges[1:]
-    total, spent = 0.0, 0
-    while low.size:
-        spent += low.size
-        begin = value(low)
-        moved = sum(p.steepest(low, high) for p in parts) * (high - low)
-        sure = moved < _SURE * np.abs(begin)
-        total += float(np.angle(value(high[sure]) / begin[sure]).sum())
-        low, high = low[~sure], high[~sure]
-        left = MOST_PIECES - spent - _BRANCH_PARTS * low.size
-        if left < 0 or np.any(high - low < _SHORTEST * high):
-            return None
-        steps = np.linspace(low, high, _BRANCH_PARTS + 1)
-        low, high = steps[:-1].ravel(), steps[1:].ravel()
-    last = complex(value(np.array([end]))[0])
-    return total - float(np.angle(last / limit))
-
-
-def _end(parts: Sequence[_Factors], near: float, sizes: Sequence[float]) -> float:
-    """Return a frequency from which on H stays within ``near`` of its limit."""
-    resonances = [1.0 / abs(d) for p in parts for d in p.d if d.imag != 0.0]
-    w = 2.0 * max([*resonances, 0.5 / max(sizes, default=1.0)])
-    while True:
-        away = 0.0
-        for part in parts:
-            instant = part.dead_time == 0.0 and part.c.size == part.d.size
-            if instant:
-                at_infinity = part.gain * np.prod(part.c) / np.prod(part.d) if part.d.size else 1.0
-                away += abs(at_infinity) * part.change_beyond(w)
-            else:
-                away += part.largest_beyond(w)
-        if away < near:
-            return w
-        w *= 1.2
 
 
 Loop = Callable[[ComplexArray], ComplexArray]
@@ -303,6 +227,8 @@ _RELEVANT = 0.05
 _PER_DECADE = 50
 # Distance of a sampled loop's grid from half the sampling frequency, relative to it.
 _BEFORE_END = 1e-9
+# Below this nothing is told of how a loop begins [rad/s].
+_LOWEST = 1e-280
 # Largest step of the phase that can be followed, and largest number of divisions of a cell.
 _FOLLOWED, _MOST_DIVISIONS = 1.0, 40
 _MOST_TURNS = 800.0 * math.pi
@@ -346,7 +272,8 @@ def frequencies(
     for c in constants:
         if c.imag > 0.0:
             centre, width = 1.0 / abs(c), abs(c.real) / abs(c)
-            parts.append(np.abs(centre * (1.0 + width * np.linspace(-8.0, 8.0, 65))) + grid[0])
+            around = centre * (1.0 + width * np.linspace(-8.0, 8.0, 65))
+            parts.append(around[around > 0.0])
     found = np.unique(np.concatenate(parts))
     if period == 0.0:
         return found

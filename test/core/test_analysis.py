@@ -197,9 +197,13 @@ def test_turns_of_a_dead_time_are_counted_as_long_as_they_matter():
     # The loop turns 2e5 times before its lag damps it, nearer to the origin than -1 is.
     swift = TransferFunction.fopdt(0.8, 1e-6, 1.0)
     assert closed_loop_unstable_poles([swift]) == 0.0
-    # This one turns 4,800 times around -1 before it is damped: too many to count them.
+    # This one turns around -1 until its magnitude is 1, at w = sqrt(8)/tau.
     strong = TransferFunction.fopdt(3.0, 1e-4, 1.0)
-    assert math.isinf(closed_loop_unstable_poles([strong]))
+    pairs = math.sqrt(8.0) / 1e-4 / (2.0 * math.pi)
+    assert closed_loop_unstable_poles([strong]) == pytest.approx(2.0 * pairs, abs=2.0)
+    # Far more turns are too many to count them.
+    stronger = TransferFunction.fopdt(3.0, 1e-6, 1.0)
+    assert math.isinf(closed_loop_unstable_poles([stronger]))
 
 
 def test_the_grid_counts_as_the_argument_principle_does_or_not_at_all():
