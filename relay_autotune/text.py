@@ -53,7 +53,11 @@ def percent(share: float) -> str:
 
 
 def counted(count: int, thing: str) -> str:
-    """Return a number of things, such as "1 sample" and "2 samples"."""
+    """Return a number of things, such as "1 sample" and "2 samples".
+
+    :param count: how many.
+    :param thing: one of them.
+    """
     return f"{count} {thing}{'' if count == 1 else 's'}"
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -134,6 +134,20 @@ def settings(gains: Gains, law: ProgramLaw, target: Target) -> str:
     :param law: the law.
     :param target: where they go.
     """
+    told, values = _remarks_and_values(gains, law, target)
+    parts = [
+        *_comments(gains, target, told, law.remark),
+        law.head.format(node=_key(target.node), dof=_key(target.dof)),
+        *(law.line.format(name=name, value=value) for name, value in values),
+        law.tail,
+    ]
+    return "\n".join(filter(None, parts)) + "\n"
+
+
+def _remarks_and_values(
+    gains: Gains, law: ProgramLaw, target: Target
+) -> tuple[tuple[str, ...], list[tuple[str, str]]]:
+    """Return what is to be known of a law's settings, and these with their values as texts."""
     low, high = limits = (target.command_min, target.command_max)
     of_command = "" if law.command == "any" else f" Its command is the {law.command}."
     if law.unset and not all(map(math.isfinite, limits)):
@@ -176,30 +190,23 @@ def settings(gains: Gains, law: ProgramLaw, target: Target) -> str:
         told += (f"{sign}, with kc {gains.kc:.6g}.",)
     elif law.form == "parallel" and scale * gains.kc < 0.0:
         told += ("All gains are negative, since a higher command lowers the measurement.",)
-    scaled = replace(gains, kc=scale * gains.kc)
-    values = list(_values(scaled, law))
-    if target.is_set_up:
-        values = [each for each in values if each[0] != "antiwindup_strategy"]
+    at = law.at(replace(gains, kc=scale * gains.kc), gains.law_period)
+    stays = ("antiwindup_strategy",) if target.is_set_up else ()
+    values = [(each.name, each.of(at)) for each in law.settings if each.name not in stays]
     if law.bounds is not None:
-        values += _texts(law.bounds(*limits))
+        values += law.bounds(*limits)
     if law.start is not None:
         known = not math.isnan(target.present)
-        present, at = scale * target.present, f" The process rested at {target.present:.6g} u."
+        present, rest = scale * target.present, f" The process rested at {target.present:.6g} u."
         if not known:
             # A program that cannot do without one begins at the command next to 0.
             present = min(max(0.0, limits[0]), limits[1])
-            at = f" It is not known here: put it in place of {present:g}." * law.start.needs
-        told += (f"Start without a bump: {law.start.words}{at}",)
+            rest = f" It is not known here: put it in place of {present:g}." * law.start.needs
+        told += (f"Start without a bump: {law.start.words}{rest}",)
         if law.start.name and (known or law.start.needs):
-            start = law.start.value(law.at(scaled, gains.law_period), present)
-            values.append((law.start.name, number(start)))
-    parts = [
-        *_comments(gains, target, told, law.remark),
-        law.head.format(node=_key(target.node), dof=_key(target.dof)),
-        *(law.line.format(name=name, value=value) for name, value in values),
-        law.tail,
-    ]
-    return "\n".join(filter(None, parts)) + "\n"
+            values.append((law.start.name, law.start.value(at, present)))
+    written = [(name, value) for name, value in values if value is not None]
+    return told, [(n, value if isinstance(value, str) else number(value)) for n, value in written]
 
 
 def _full_command(law: ProgramLaw, target: Target) -> float:
@@ -255,14 +262,8 @@ def controller_values(gains: Gains, target: Target) -> dict[str, Any]:
     :param gains: that it runs.
     :param target: as of :func:`controller_file`.
     """
-    values = {n: float(f"{getattr(gains, n):.{_DIGITS}g}") for n in ("kc", "ti", "td", "tf", "b")}
-    given = {
-        "initial_command": target.present,
-        "command_min": target.command_min,
-        "command_max": target.command_max,
-    }
-    values |= {name: value for name, value in given.items() if math.isfinite(value)}
-    return values | dict(target.parameters)
+    _, values = _remarks_and_values(gains, LAWS[OWN_LAW], target)
+    return {name: float(value) for name, value in values} | dict(target.parameters)
 
 
 def launch_file(gains: Gains, target: Target) -> str:
@@ -297,20 +298,6 @@ def launch_file(gains: Gains, target: Target) -> str:
         "    )",
     ]
     return "\n".join(lines) + "\n"
-
-
-def _values(gains: Gains, law: ProgramLaw) -> list[tuple[str, str]]:
-    """Return the settings of a law as texts, those without a value left out."""
-    at = law.at(gains, gains.law_period)
-    return _texts((each.name, each.of(at)) for each in law.settings)
-
-
-def _texts(found: Iterable[tuple[str, float | str | None]]) -> list[tuple[str, str]]:
-    return [
-        (name, value if isinstance(value, str) else number(value))
-        for name, value in found
-        if value is not None
-    ]
 
 
 def plain(gains: Gains, target: Target) -> str:
