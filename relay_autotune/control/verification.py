@@ -15,7 +15,7 @@ from scipy.special import ndtr
 from relay_autotune.arrays import FloatArray
 from relay_autotune.control.controller import Control, run_loop, scaled
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.analysis import Loop
+from relay_autotune.loop.analysis import Loop, is_stable
 from relay_autotune.loop.sampled import UNLIMITED, Limits
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code, Reason
@@ -202,7 +202,7 @@ def plan(
             f"{rate.period:.3g} s: these gains can only be proven in their own program; design "
             f"them for the sensor, with a sampling period of {period:.3g} s"
         )
-    if not runs_stably(control, model):
+    if not is_stable(control.law, model):
         raise TuningError("these gains make an unstable loop with the model: nothing to verify")
     horizon = max(8.0 * (control.gains.ti + model.dead_time), LEAST_SAMPLES * period)
     for _ in range(_DOUBLINGS):
@@ -440,16 +440,6 @@ def compare(
         ms=ms,
         ms_predicted=ms_predicted,
     )
-
-
-def runs_stably(control: Control, model: TransferFunction) -> bool:
-    """Return whether the closed loop is stable.
-
-    :param control: the controller.
-    :param model: the process.
-    :raises TuningError: if the law cannot run them.
-    """
-    return Loop(control.law, model).unstable_poles == 0
 
 
 def _ms(control: Control, model: TransferFunction) -> float:

@@ -24,7 +24,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from relay_autotune.control.controller import is_usable, running
 from relay_autotune.control.gains_history import GainSet
-from relay_autotune.control.verification import Step, runs_stably
+from relay_autotune.control.verification import Step
 from relay_autotune.errors import (
     FieldError,
     NotReadyError,
@@ -33,6 +33,7 @@ from relay_autotune.errors import (
     TuningError,
 )
 from relay_autotune.exchange.export import TOPICS
+from relay_autotune.loop.analysis import is_stable
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.nodes import quality, tables
 from relay_autotune.nodes.gains_keeper import GainsJournal, GainsKeeper
@@ -121,7 +122,7 @@ class ControllerNode(ServedNode):
         self._rate = tables.rate_from(values)
         self._settings = tables.settings_from(values, self._rate)
         gains = self._settings.gains
-        self._results = ResultCheck(self, lambda c, m: runs_stably(self._place.control(c), m))
+        self._results = ResultCheck(self, lambda c, m: is_stable(self._place.control(c).law, m))
         # The gains that wait to be applied, with the id of their experiment.
         self._pending: tuple[str, Gains] | None = None
         # Why those that came since were refused; empty: none were.

@@ -33,6 +33,7 @@ from relay_autotune.process.factors import (
     Parameter,
     Quadratic,
     exactly,
+    positive,
 )
 from relay_autotune.process.transfer_function import TransferFunction
 
@@ -155,10 +156,8 @@ class Structure:
         gain = -given[GAIN] if self.unstable else given[GAIN]
         zeros: tuple[float, ...] = ()
         if self.zero is not None:
-            value = given[self.zero]
+            value = positive(given[self.zero]) if self.zero.logarithmic else given[self.zero]
             zeros = (-value if self.zero.turned else value,)
-            if self.zero.logarithmic and not value > 0.0:
-                raise ModelError(f"a time constant here must be > 0 s, found {value:g} s")
         constants: list[complex] = []
         for factor in sorted(self.factors, key=lambda f: PARAMETERS.index(f.parameters[0])):
             constants += factor.poles([given[p] for p in factor.parameters])
