@@ -380,7 +380,7 @@ def _thirds(time: FloatArray, values: FloatArray) -> list[FloatArray]:
 def is_growing(swings: Sequence[float]) -> bool:
     """Return True if the swings of the cycles grow like those of an unstable loop.
 
-    :param swings: peak to peak of each cycle so far [y].
+    :param swings: of each cycle so far, in one measure [y].
     """
     last = swings[-(_STEPS + 1) :]
     if len(last) <= _STEPS or last[0] <= 0.0 or last[-1] < _LARGER * last[0]:
@@ -453,9 +453,8 @@ def proportional_hold(
     if cycles:
         last = cycles[-1]
         centre = last.mean_command
-        half_swing = 0.5 * (last.peak_max - last.peak_min)
-        if gain == 0.0 and half_swing > 0.0:
-            gain = HOLD_SHARE * 4.0 * settings.amplitude / (math.pi * half_swing)
+        if gain == 0.0 and last.amplitude > 0.0:
+            gain = HOLD_SHARE * 4.0 * settings.amplitude / (math.pi * last.amplitude)
             gain = -gain if settings.reverse_acting else gain
     if gain == 0.0:
         return None

@@ -102,10 +102,6 @@ def usual_period(cycles: Sequence[Cycle]) -> float:
     return clean[len(clean) // 4] if len(clean) > 1 else 0.0
 
 
-def _swing(cycle: Cycle) -> float:
-    return cycle.peak_max - cycle.peak_min
-
-
 class _FastWatch:
     """See that the relay switches faster than the process can make it.
 
@@ -477,7 +473,7 @@ class Switching:
         if n + course.stays.lost >= p.max_cycles:
             more = {"needed": p.min_cycles, **agreed} if self._setup.until_converged else {}
             return self._complete(Code.MAX_CYCLES(most=p.max_cycles, cycles=n, **more))
-        self._furthest = 0.5 * _RUNAWAY * max(map(_swing, self.cycles))
+        self._furthest = _RUNAWAY * max(cycle.amplitude for cycle in self.cycles)
         # A cycle much longer than the one before may hold an actuator that stuck; a load would
         # show in the next cycle, too.
         is_alone = n > 1 and cycle.period > _ALONE * self.cycles[-2].period
@@ -548,7 +544,7 @@ class Switching:
         return self._course.fast.cycle(self.switches, len(self.cycles))
 
     def _growth(self) -> Reason | None:
-        growing = is_growing([*map(_swing, self.cycles)])
+        growing = is_growing([cycle.amplitude for cycle in self.cycles])
         return Code.GROWING(cycles=len(self.cycles)) if growing else None
 
     def _clipped(self) -> Reason | None:
@@ -556,7 +552,7 @@ class Switching:
         levels = self._setup.levels
         if not (levels.from_small and self.is_tried):
             return None
-        before, last = (0.5 * _swing(cycle) for cycle in self.cycles[-2:])
+        before, last = (cycle.amplitude for cycle in self.cycles[-2:])
         return None if last > _STILL * before else levels.why_clipped(last, settled=True)
 
     def _only_noise(self, least: int = TELL) -> Reason | None:

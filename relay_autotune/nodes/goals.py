@@ -227,7 +227,7 @@ class TuneAction(OneGoal):
         if experiment.cycle_count:
             last = experiment.cycles[-1]
             feedback.period = last.period
-            feedback.amplitude = 0.5 * (last.peak_max - last.peak_min)
+            feedback.amplitude = last.amplitude
         self.running.publish_feedback(feedback)
         # Each model is told once, since it is long.
         self._newest = TransferFunction()

@@ -480,7 +480,7 @@ def _expected(
     if last is not None:
         amplitude, cycle = last
         ratio = parameters.amplitude / amplitude if parameters.amplitude else 1.0
-        swing = 0.5 * (cycle.peak_max - cycle.peak_min) * ratio
+        swing = cycle.amplitude * ratio
         return f"a swing of about {swing:.2g} y each way in {duration(cycle.period)}, as last time"
     low, high = parameters.measurement_min, parameters.measurement_max
     limits = [f"{limit:g}" for limit in (low, high) if math.isfinite(limit)]

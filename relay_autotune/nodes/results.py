@@ -324,8 +324,8 @@ class OwnResults(ResultCheck):
             if on_setpoint:
                 sign = 0
             elif settings is not None:
-                last = cycles[-1].peak_max - cycles[-1].peak_min if cycles else swing
-                amplitude, relay = 0.5 * last, settings.amplitude
+                amplitude = cycles[-1].amplitude if cycles else 0.5 * swing
+                relay = settings.amplitude
             found = finding_from_message(message)
             check_finding(found, sign=sign, amplitude=amplitude, relay=relay)
             facts.check_model(transfer_function_from_message(message))

@@ -389,7 +389,7 @@ def agree(cycles: Sequence[Cycle], noise_std: float, interval: float, tolerance:
     :param tolerance: relative difference allowed.
     """
     count = len(cycles)
-    swing = sum(c.peak_max - c.peak_min for c in cycles) / count
+    swing = 2.0 * sum(c.amplitude for c in cycles) / count
     highs, lows = [c.period_high for c in cycles], [c.period_low for c in cycles]
     shorter, longer = sorted((sum(highs) / count, sum(lows) / count))
     if swing <= 0.0 or shorter <= 0.0:

@@ -164,6 +164,11 @@ class CycleFeatures:
     mean_command: float = result_field("u", nan=True, message=None)
     """Time average of the command."""
 
+    @property
+    def amplitude(self) -> float:
+        """Half the swing of the measurement [y]."""
+        return 0.5 * (self.peak_max - self.peak_min)
+
 
 @dataclass(frozen=True)
 class Cycle(CycleFeatures):

@@ -227,11 +227,13 @@ def describing_point_of_cycle(
     :param sign: of the process.
     :return: None if the measurement does not move.
     """
-    amplitude = 0.5 * (cycle.peak_max - cycle.peak_min)
-    if not amplitude > 0.0:
+    if not cycle.amplitude > 0.0:
         return None
     gain = (
-        4.0 * relay / (math.pi * amplitude) * math.sin(math.pi * cycle.period_high / cycle.period)
+        4.0
+        * relay
+        / (math.pi * cycle.amplitude)
+        * math.sin(math.pi * cycle.period_high / cycle.period)
     )
     return UltimatePoint(math.copysign(gain, sign), 2.0 * math.pi / cycle.period)
 
