@@ -35,7 +35,6 @@ from relay_autotune.experiment.faults import (
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.phases import (
     Ended,
-    Event,
     Facts,
     Kick,
     Left,
@@ -62,12 +61,10 @@ counted [s], inf: max_duration alone limits it; ``where`` is the state as the en
 says what it waits for and sees, after the same sample.
 """
 
-_TRANSITIONS: Mapping[tuple[State, Event], tuple[State, Callable[[Setup, Facts], Phase]]] = {
-    (State.SETTLING, Event.STEADY): (State.KICK, Kick),
-    (State.KICK, Event.RESPONSE): (State.RELAY, Switching),
-    (State.KICK, Event.UNSIGNED_RESPONSE): (State.PROBE, Probe),
-    (State.PROBE, Event.DIRECTION): (State.RELAY, Switching),
-    (State.PROBE, Event.NO_DIRECTION): (State.KICK, Kick),
+_PHASES: Mapping[State, Callable[[Setup, Facts], Phase]] = {
+    State.KICK: Kick,
+    State.PROBE: Probe,
+    State.RELAY: Switching,
 }
 
 
@@ -354,8 +351,8 @@ class RelayExperiment:
         found = end or self._phase.answer(trace.seen[-1], y)
         if isinstance(found, Left):
             self._facts = found.facts
-            self.state, begin = _TRANSITIONS[self.state, found.event]
-            self._phase = phase = begin(self._setup, found.facts)
+            self.state = found.then
+            self._phase = phase = _PHASES[found.then](self._setup, found.facts)
             self._relay = phase if isinstance(phase, Switching) else None
             found = phase.command
         if isinstance(found, Ended):

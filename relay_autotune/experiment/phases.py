@@ -167,26 +167,15 @@ class Setup:
         return self.levels.high if is_high else self.levels.low
 
 
-class Event(enum.Enum):
-    """What ends a state."""
-
-    STEADY = enum.auto()
-    """The measurement is at rest."""
-    RESPONSE = enum.auto()
-    """The process has responded to the kick, and the sign of its gain is given."""
-    UNSIGNED_RESPONSE = enum.auto()
-    """The process has responded, and the sign is not known."""
-    DIRECTION = enum.auto()
-    """The sign has been found."""
-    NO_DIRECTION = enum.auto()
-    """Nothing is left of the response."""
-
-
 @dataclass(frozen=True)
 class Left:
-    """A state has ended by an event, with what is known then."""
+    """A state has ended.
 
-    event: Event
+    :param then: the state after it.
+    :param facts: what is known now.
+    """
+
+    then: State
     facts: Facts
 
 
@@ -315,7 +304,7 @@ class Settle:
             hysteresis=p.band(rest.noise_std),
             sign=p.process_gain_sign,
         )
-        return Left(Event.STEADY, facts)
+        return Left(State.KICK, facts)
 
     def status(self, t: float, _: float) -> str:
         """Say what it waits for and sees."""
@@ -379,7 +368,7 @@ class Kick:
                 side=detector.side,
                 response_time=detector.first_outside - self._begun,
             )
-            return Left(Event.RESPONSE if facts.sign else Event.UNSIGNED_RESPONSE, facts)
+            return Left(State.RELAY if facts.sign else State.PROBE, facts)
         if levels.can_grow and since >= self._grow_after:
             levels.grow()
             self._grow_after *= 2.0
@@ -433,8 +422,8 @@ class Probe:
             # The pulse left no deviation: noise had looked like a response.
             if levels.from_small:
                 levels.begin_larger()
-            return Left(Event.NO_DIRECTION, self._facts)
-        return Left(Event.DIRECTION, replace(self._facts, sign=sign))
+            return Left(State.KICK, self._facts)
+        return Left(State.RELAY, replace(self._facts, sign=sign))
 
     def status(self, t: float, y: float) -> str:
         """Say what it waits for and sees."""
