@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.process.response import response
-from relay_autotune.process.simulation import RelayRun, simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "support"))
+from relay_runs import RelayRun, simulate_relay
 from sampled_relay import exact_limit_cycle, simulate_sampled_relay
 
 FloatArray = NDArray[np.float64]

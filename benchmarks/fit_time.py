@@ -16,10 +16,10 @@ from reference import Timing, take_turns
 # isort: split
 import numpy as np
 from cases import CASES
+from relay_runs import simulate_relay
 
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.record.record import Record
 
 # By structure and number of samples [ms].

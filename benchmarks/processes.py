@@ -16,7 +16,6 @@ from relay_autotune import threads  # noqa: F401  before numpy
 # isort: split
 import numpy as np
 
-from relay_autotune.process.simulation import RelayRun, simulate_relay
 from relay_autotune.process.structures import (
     INTEGRATOR_INVERSE,
     INTEGRATOR_LAG,
@@ -33,6 +32,7 @@ from relay_autotune.process.ultimate import UltimatePoint, ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "support"))
+from relay_runs import RelayRun, simulate_relay
 from sampled_relay import exact_limit_cycle, simulate_sampled_relay
 
 PER_CYCLE = 200

@@ -154,8 +154,8 @@ def _ideal(model: TransferFunction, noise: float) -> Cycle:
 
 def _mean(model: TransferFunction, noise: float, cycle: Cycle) -> float:
     time = cycle.start + cycle.period * np.arange(200) / 200
-    run = simulate_relay(model, _settings(model, noise), cycles=IDEAL_CYCLES, time=time)
-    return float(np.mean(np.abs(run.measurement)))
+    run = simulate_relay(model, _settings(model, noise), cycles=IDEAL_CYCLES)
+    return float(np.mean(np.abs(run.output(time))))
 
 
 def _settings(model: TransferFunction, noise: float) -> RelaySettings:

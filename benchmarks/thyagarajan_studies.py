@@ -37,13 +37,14 @@ from relay_autotune.identification.methods import identify
 from relay_autotune.identification.methods.lags import EXACT, FIRST, equal
 from relay_autotune.identification.methods.thyagarajan import HIGHER_ORDER, SMALL_DEAD_TIME
 from relay_autotune.identification.methods.wang import flat_fopdt, fopdt
-from relay_autotune.process.simulation import HalfCycle, RelayRun, simulate_relay
+from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record, RelaySettings
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "support"))
+from relay_runs import RelayRun, simulate_relay
 from sampled_relay import exact_limit_cycle
 
 FloatArray = NDArray[np.float64]

@@ -20,7 +20,6 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +28,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.process.response import Coordinates, Modes
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import Cycle, Outcome, PiecewiseConstant, Record, RelaySettings
+from relay_autotune.record.record import Cycle, PiecewiseConstant, RelaySettings
 from relay_autotune.scalar import root
 
 
@@ -121,6 +120,8 @@ class HalfCycle:
         return float(np.max(np.abs(roots))) if roots.size else 0.0
 
 
+# More switches than this count as chatter.
+_MOST_SWITCHES = 20_000
 _QUADRATURE = np.polynomial.legendre.leggauss(8)
 
 
@@ -132,45 +133,12 @@ class RelayRun:
     :param command: the command with its exact switch instants.
     :param cycles: every whole cycle, with exact times and peaks.
     :param output: returns the noise-free measurement at instants of the run [y].
-    :param time: sample times [s], shape (n,).
     """
 
     settings: RelaySettings
     command: PiecewiseConstant
     cycles: tuple[Cycle, ...]
     output: Callable[[FloatArray], FloatArray]
-    time: FloatArray
-
-    @cached_property
-    def measurement(self) -> FloatArray:
-        """The noise-free measurement at the sample times [y], shape (n,)."""
-        return self.output(self.time)
-
-    def record(self, *, noise_std: float = 0.0, rng: np.random.Generator | None = None) -> Record:
-        """Return the samples as a record, with noise that the relay did not see.
-
-        :param noise_std: standard deviation of white Gaussian noise [y].
-        :param rng: its source; needed if ``noise_std`` > 0.
-        """
-        y = self.measurement
-        if noise_std > 0.0:
-            if rng is None:
-                raise ModelError("noise needs a random generator, found none")
-            y = y + noise_std * rng.standard_normal(y.size)
-        starts = [c.start for c in self.cycles]
-        if self.cycles:
-            starts.append(starts[-1] + self.cycles[-1].period)
-        boundaries = np.unique(np.searchsorted(self.time, starts))
-        return Record(
-            time=self.time,
-            measurement=y,
-            command=self.command(self.time),
-            settings=self.settings,
-            noise_std=noise_std,
-            cycle_start=tuple(int(b) for b in boundaries if b < self.time.size),
-            outcome=Outcome.COMPLETED,
-            held_input=self.command,
-        )
 
 
 def _at_zero(function: Callable[[float], float], grid: FloatArray, i: int) -> float:
@@ -245,11 +213,9 @@ def simulate_relay(
     settings: RelaySettings,
     *,
     cycles: int,
-    time: ArrayLike | int = (),
     operating_point: float | None = None,
     kick: float | None = None,
     told: int | None = None,
-    most_switches: int = 20_000,
 ) -> RelayRun:
     """Run an ideal relay on a process, from switch to switch, without a time step.
 
@@ -261,13 +227,10 @@ def simulate_relay(
     :param model: the process.
     :param settings: levels, set-point, hysteresis.
     :param cycles: whole cycles to run.
-    :param time: instants of the samples [s], not decreasing, shape (n,), of which those after the
-        end of the last cycle are left out; or how many, evenly spaced up to the last switch.
     :param operating_point: measurement at rest [y]; default: the set-point.
     :param kick: how far above the set-point the measurement must rise before the first
         switch [y]; default: the hysteresis.
     :param told: number of cycles to return, the last ones; default: all of them.
-    :param most_switches: more switches than this count as chatter.
     :raises ModelError: if the measurement never reaches a switching level, or the relay chatters.
     """
     dead_time = model.dead_time + settings.extra_delay
@@ -321,9 +284,9 @@ def simulate_relay(
             threshold = settings.setpoint + (1 if rising else -1) * settings.hysteresis
             switches.append((now, settings.high if is_high else settings.low))
             on_the_way.append((now + dead_time, switches[-1][1]))
-            if len(switches) > most_switches:
+            if len(switches) > _MOST_SWITCHES:
                 raise ModelError(
-                    f"{most_switches} switches by t = {now:g} s: the relay chatters on this "
+                    f"{_MOST_SWITCHES} switches by t = {now:g} s: the relay chatters on this "
                     "process; a dead time or a hysteresis is needed for a limit cycle"
                 )
     times, levels = (np.array(column) for column in zip(*switches, strict=True))
@@ -338,9 +301,7 @@ def simulate_relay(
             y[number == k] = pieces[k].output(at[number == k] - pieces[k].begin)
         return y
 
-    samples = np.linspace(0.0, times[-1], time) if isinstance(time, int) else np.asarray(time)
-    inside = samples[(samples >= 0.0) & (samples <= now)]
-    return RelayRun(settings, command, found, output, inside)
+    return RelayRun(settings, command, found, output)
 
 
 def _no_delay(time: float) -> ModelError:

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from relay_runs import simulate_relay
 
 from relay_autotune.cli.table import table
 from relay_autotune.exchange.messages import fill_transfer_function
@@ -27,7 +28,6 @@ from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import Validation
 from relay_autotune.identification.waveform.residuals import noise_to_signal
 from relay_autotune.process.response import response
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import result_fields

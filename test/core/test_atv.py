@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 import pytest
+from relay_runs import simulate_relay
 from sampled_relay import exact_limit_cycle
 from worked_cases import cases
 
@@ -30,7 +31,6 @@ from relay_autotune.identification.methods.lags import (
     solutions,
     with_amplitude,
 )
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import equal_lags
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

@@ -9,13 +9,13 @@ import math
 
 import numpy as np
 import pytest
+from relay_runs import simulate_relay
 
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.identification.waveform.findings import point_stds
 from relay_autotune.identification.waveform.fit_covariance import Fit, estimate_of
 from relay_autotune.identification.waveform.separable import evaluate, problem_of
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import FOPDT, SOPDT, SOPDT_ZERO, Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

@@ -12,6 +12,7 @@ import pytest
 from forward import peak_of_harmonics
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from relay_runs import simulate_relay
 from sampled_relay import exact_limit_cycle, simulate_sampled_relay
 from worked_cases import cases
 
@@ -32,7 +33,6 @@ from relay_autotune.identification.methods.lags import (
     solutions,
     with_amplitude,
 )
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import SOPDT, TWO_EQUAL_ONE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from relay_runs import simulate_relay
 
 from relay_autotune.errors import ModelError, ParameterError, TuningError
 from relay_autotune.exchange.evidence import ExperimentFacts, check_finding
 from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.loop.gains import Controller
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import INTEGRATOR_INVERSE, IPDT, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

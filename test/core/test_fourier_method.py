@@ -9,12 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from relay_runs import simulate_relay
 from sampled_relay import exact_limit_cycle
 
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import METHODS, identify
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import (
     INTEGRATOR_INVERSE,
     INTEGRATOR_LAG,

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from relay_runs import simulate_relay
 from sampled_relay import exact_limit_cycle
 from worked_cases import cases
 
@@ -16,7 +17,7 @@ from relay_autotune.errors import ModelError
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.limit_cycle.shape import normalised_growth
 from relay_autotune.identification.methods.lags import equal
-from relay_autotune.process.simulation import HalfCycle, simulate_relay
+from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.structures import INTEGRATOR_INVERSE, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings

@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 import pytest
+from relay_runs import simulate_relay
 from sampled_relay import exact_limit_cycle
 
 from relay_autotune.errors import IdentificationError
@@ -23,7 +24,6 @@ from relay_autotune.identification.methods.li import (
     fits_jointly,
     li_from_numbers,
 )
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import equal_lags
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

@@ -10,6 +10,7 @@ import pytest
 from forward import step_features, step_response
 from hypothesis import given
 from hypothesis import strategies as st
+from relay_runs import simulate_relay
 from scipy.optimize import fsolve
 from worked_cases import cases
 
@@ -21,7 +22,6 @@ from relay_autotune.identification.methods.luyben import (
     identify_step_numbers,
 )
 from relay_autotune.process.response import response
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import INTEGRATOR_INVERSE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from relay_runs import simulate_relay
 from sampled_relay import exact_limit_cycle, simulate_sampled_relay
 from worked_cases import cases
 
@@ -28,7 +29,7 @@ from relay_autotune.identification.limit_cycle.shape import (
     shape_of_half_cycle,
     shape_of_record,
 )
-from relay_autotune.process.simulation import HalfCycle, simulate_relay
+from relay_autotune.process.simulation import HalfCycle
 from relay_autotune.process.structures import UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record, RelaySettings

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from relay_runs import simulate_relay
 
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.candidates import support
@@ -23,7 +24,6 @@ from relay_autotune.identification.waveform.rational import (
 from relay_autotune.identification.waveform.starts import is_unobservable
 from relay_autotune.process.factors import Denominator, Lag, Quadratic
 from relay_autotune.process.response import response
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import (
     FOPDT,
     INTEGRATOR_INVERSE,

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from relay_runs import simulate_relay
 from worked_cases import PROCESSES, cases
 
 from relay_autotune.control.controller import simulate_closed_loop
@@ -18,7 +19,6 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.loop.analysis import analyse_loop, is_stable
 from relay_autotune.loop.gains import Controller
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 from relay_autotune.tuning import design, tune

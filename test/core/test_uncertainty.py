@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from relay_runs import simulate_relay
 
 from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
@@ -21,7 +22,6 @@ from relay_autotune.identification.waveform.fit_covariance import Fit, quantisat
 from relay_autotune.identification.waveform.posterior import _allowed, _apart, posterior
 from relay_autotune.identification.waveform.separable import evaluate, problem_of, refine
 from relay_autotune.process.response import response
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings

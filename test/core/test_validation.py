@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from relay_runs import simulate_relay
 from sampled_relay import simulate_sampled_relay
 from worked_cases import cases
 
@@ -20,7 +21,6 @@ from relay_autotune.identification.judgement.assessment import (
 )
 from relay_autotune.identification.limit_cycle.fold import fold
 from relay_autotune.identification.limit_cycle.fourier import SteadyState
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import INTEGRATOR_INVERSE, UNSTABLE_FOPDT, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record, RelaySettings

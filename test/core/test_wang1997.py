@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from forward import fopdt_limit_cycle
+from relay_runs import simulate_relay
 from sampled_relay import simulate_sampled_relay
 from worked_cases import cases
 
@@ -26,7 +27,6 @@ from relay_autotune.identification.methods.wang import (
     identify_biased,
     identify_unbiased,
 )
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.structures import IPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

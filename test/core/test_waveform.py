@@ -14,6 +14,7 @@ from fopdt_plant import FopdtPlant
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_experiments import record_of
+from relay_runs import RelayRun, simulate_relay
 from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.errors import IdentificationError, ParameterError
@@ -28,7 +29,6 @@ from relay_autotune.identification.waveform.starts import (
     time_scales,
 )
 from relay_autotune.process.response import response
-from relay_autotune.process.simulation import RelayRun, simulate_relay
 from relay_autotune.process.structures import TABLE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import rclpy
 from rclpy.parameter import Parameter
+from relay_runs import simulate_relay
 
 from relay_autotune.analysis import KNOWN, PARAMETERS, known_from
 from relay_autotune.cli.own_nodes import free_domain
@@ -24,7 +25,6 @@ from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.nodes.identifier import IdentifierNode
 from relay_autotune.nodes.lifetime import Executor
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import RelaySettings
 from relay_autotune_msgs.msg import RelayCycle, RelayExperiment

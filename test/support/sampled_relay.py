@@ -11,10 +11,10 @@ from functools import cache
 from itertools import pairwise
 
 import numpy as np
+from relay_runs import simulate_relay
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
-from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.record import Cycle, Outcome, Record, RelaySettings
