@@ -513,7 +513,12 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
         raise SelectionError(f"unknown rule {rule!r}; known: {', '.join(RULES)}")
     if options.web:
         check_web(options)
-    task = task_of_model(model_of(options), design_options(options))
+    asked = design_options(options)
+    if asked.law and not asked.sample_period:
+        raise SelectionError(
+            f"{asked.law} runs at a sampling period: give it with --sample-period S"
+        )
+    task = task_of_model(model_of(options), asked)
     if options.table or options.web:
         every = _Designs.by_all_rules(task, rule, options.form)
     status = _told(every, options) if options.table else _one(task, rule, options)

@@ -232,7 +232,7 @@ def test_exports(capsys, tmp_path):
     asked = "--rule imc --export"
     to_heater = "pid_controller --dof heater --command-max 100"
     status, out, err = run(capsys, FOPDT, asked, to_heater)
-    assert (status, out) == (1, "") and "give sample_period" in err
+    assert (status, out) == (2, "") and "give it with --sample-period S" in err
     _, out, _ = run(capsys, FOPDT, asked, to_heater, "--sample-period 0.5")
     (section,) = yaml.safe_load(out).values()
     # The rule's formula with a dead time of 10 s and half a period.
