@@ -224,11 +224,11 @@ def _exported(
             "--accept-doubtful to export them anyway"
         )
     assert only.best_gains is not None
-    gains, to = only.best_gains, _from_rest(target, only.record, only.shaping)
+    gains, to = only.best_gains, _target_from(target, only.record, only.shaping)
     return gains, to, exported(gains, how, to, doubt=only.judgement.reason).rstrip("\n")
 
 
-def _from_rest(target: Target, record: Record | None, shaping: Shaping | None) -> Target:
+def _target_from(target: Target, record: Record | None, shaping: Shaping | None) -> Target:
     """Return where gains go with units, noise, and the command at which a record rests."""
     if shaping is not None:
         target = replace(target, noise_std=shaping.task.options.noise_std)
@@ -567,7 +567,7 @@ def show(
             )
 
         return PageModel(
-            case, shaping, first, command, target=_from_rest(target, case.record, shaping)
+            case, shaping, first, command, target=_target_from(target, case.record, shaping)
         )
 
     subjects = [subject(case, shaping) for case, shaping in models]
