@@ -436,13 +436,12 @@ class Probe:
 
 
 def how_long(
-    parameters: ExperimentParameters, interval: float, limit: float, *, from_small: bool = False
+    parameters: ExperimentParameters, interval: float, *, from_small: bool = False
 ) -> str:
     """Say how long a tune may take, before it begins.
 
     :param parameters: the experiment's parameters.
     :param interval: mean interval of the samples [s]; 0: not known.
-    :param limit: longest settling [s].
     :param from_small: whether a given amplitude begins at a quarter of that.
     """
     if parameters.settle_time > 0.0:
@@ -450,7 +449,7 @@ def how_long(
     else:
         least = NOISE_SAMPLES * interval
         settles = f"{duration(least)} or more" if least > 0.0 else "some time"
-        settles += f" until the measurement is steady, {duration(limit)} at most"
+        settles += f" until the measurement is steady, {duration(SETTLING_LIMIT)} at most"
     usual = parameters.min_cycles + _USUAL_EXTRA + from_small * SMALL_CYCLES
     sentence = f"it takes {settles}, then one step and about {usual} oscillations of the loop"
     if parameters.max_duration > 0.0:

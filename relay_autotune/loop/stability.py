@@ -264,7 +264,8 @@ def frequencies(
         parts.append(top * (1.0 - np.geomspace(1e-6, 0.5, 80)))
     if dead_times:
         values = np.array([loop(1j * grid)] if loop else [t(1j * grid) for t in terms])
-        last = _relevant_frequencies(values, grid)[-1]
+        relevant = grid[np.abs(values).max(axis=0) > _RELEVANT]
+        last = relevant[-1] if relevant.size else grid[0]
     for d in dead_times:
         # First turns of the dead time finely, later ones more coarsely.
         parts.append(np.arange(0.05, min(12.0 * math.pi, top * d), 0.05) / d)
@@ -278,16 +279,6 @@ def frequencies(
     if period == 0.0:
         return found
     return np.append(found[found < top * (1.0 - 1e-7)], top * (1.0 - _BEFORE_END))
-
-
-def _relevant_frequencies(values: ComplexArray, grid: FloatArray) -> FloatArray:
-    """Return the frequencies at which some loop has an influence, whatever its phase.
-
-    :param values: of loops, shape (k, n).
-    :param grid: rad/s, shape (n,).
-    """
-    found = grid[np.abs(values).max(axis=0) > _RELEVANT]
-    return found if found.size else grid[:1]
 
 
 def peaks(loop: Loop, grid: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:

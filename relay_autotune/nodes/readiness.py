@@ -24,7 +24,7 @@ from relay_autotune.exchange.messages import fill_reason
 from relay_autotune.experiment.faults import SafePolicy
 from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.experiment.phases import SETTLING_LIMIT, SMALL_CYCLES, how_long
+from relay_autotune.experiment.phases import SMALL_CYCLES, how_long
 from relay_autotune.experiment.relay_law import Levels, clear_swing, sought_swing
 from relay_autotune.nodes.goals import refused
 from relay_autotune.nodes.loop_ends import LoopSupervisor, RelayTopics
@@ -240,8 +240,7 @@ class Readiness:
         :param parameters: the experiment's parameters.
         """
         small = ready is not None and ready.from_small
-        interval = self._sensor.samples.interval
-        return how_long(parameters, interval, SETTLING_LIMIT, from_small=small)
+        return how_long(parameters, self._sensor.samples.interval, from_small=small)
 
     def _planned(
         self,

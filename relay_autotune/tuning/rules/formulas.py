@@ -229,12 +229,8 @@ def describing_point_of_cycle(
     """
     if not cycle.amplitude > 0.0:
         return None
-    gain = (
-        4.0
-        * relay
-        / (math.pi * cycle.amplitude)
-        * math.sin(math.pi * cycle.period_high / cycle.period)
-    )
+    gain = 4.0 * relay / (math.pi * cycle.amplitude)
+    gain *= math.sin(math.pi * cycle.period_high / cycle.period)
     return UltimatePoint(math.copysign(gain, sign), 2.0 * math.pi / cycle.period)
 
 
