@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.experiment.parameters import FIRST_SHARE, ExperimentParameters
@@ -176,9 +177,31 @@ _MAY_REACH = 0.75
 # First share of a given amplitude, since its levels may lie beyond the actuator's ends.
 _SMALL = 0.25
 
-# Growth of the levels, and least growth of the swing with it; below that the actuator is clipped.
-# The hysteresis makes small swings larger than proportional, by a third at most.
+# Growth of the levels, and least growth of the swing, or of its rate, with it; below that the
+# actuator is clipped. The first swing at an amplitude is not settled.
 _GROWN, _CLIPPED = 3.0, 1.5
+
+
+@dataclass(frozen=True)
+class Swing:
+    """What a cycle shows of the process's answer.
+
+    :param half: half the swing of the measurement [y].
+    :param period: s.
+    """
+
+    half: float
+    period: float
+
+    def over(self, other: Swing) -> float:
+        """Return by how much the answer has grown.
+
+        With the levels grows the swing, or its rate where noise or hysteresis hold its size: a
+        larger command crosses them faster.
+
+        :param other: the swing before.
+        """
+        return self.half / other.half * max(1.0, other.period / self.period)
 
 
 class Levels:
@@ -212,8 +235,8 @@ class Levels:
             self._wanted = parameters.first_amplitude
         # The amplitude of the last swing.
         self._seen_at = 0.0
-        # Amplitude, half swing and levels of the first cycle that was clear of the noise.
-        self._first_clear: tuple[float, float, float, float] | None = None
+        # Amplitude, swing and levels of the first cycle that was clear of the noise.
+        self._first_clear: tuple[float, Swing, float, float] | None = None
         self._set()
 
     def _set(self) -> None:
@@ -287,14 +310,14 @@ class Levels:
         self._shift += by
         self._set()
 
-    def note_small(self, half_swing: float, clear: float) -> None:
+    def note_small(self, swing: Swing, clear: float) -> None:
         """Keep the first swing of the measurement that is clear of noise.
 
-        :param half_swing: half the swing of the measurement over the last cycle [y].
+        :param swing: of the last cycle.
         :param clear: the half swing that is clear of noise, hysteresis and resolution [y].
         """
-        if self._first_clear is None and half_swing >= clear:
-            self._first_clear = self.amplitude, half_swing, self.low, self.high
+        if self._first_clear is None and swing.half >= clear:
+            self._first_clear = self.amplitude, swing, self.low, self.high
 
     @property
     def grew_enough(self) -> bool:
@@ -302,25 +325,26 @@ class Levels:
         first = self._first_clear
         return first is not None and self.amplitude >= _GROWN * first[0]
 
-    def why_clipped(self, half_swing: float, *, settled: bool) -> Reason | None:
+    def why_clipped(self, swing: Swing, *, settled: bool) -> Reason | None:
         """Return why the actuator must be at its ends, None if it need not.
 
         A response that is clear of noise must grow with the levels.
 
-        :param half_swing: half the swing of the measurement over the last cycle [y].
+        :param swing: of the last cycle.
         :param settled: True: the swing does not grow any more, and must have grown by at least
             the square root of the growth of the levels.
         """
         if self._first_clear is None or not self.grew_enough:
             return None
-        amplitude, swing, low, high = self._first_clear
-        if half_swing >= swing * (math.sqrt(self.amplitude / amplitude) if settled else _CLIPPED):
+        amplitude, first, low, high = self._first_clear
+        least = math.sqrt(self.amplitude / amplitude) if settled else _CLIPPED
+        if swing.over(first) >= least:
             return None
         return Code.CLIPPED(
             before=amplitude,
             now=self.amplitude,
-            swing_before=swing,
-            swing=half_swing,
+            swing_before=first.half,
+            swing=swing.half,
             low=low,
             high=high,
         )

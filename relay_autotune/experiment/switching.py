@@ -30,6 +30,7 @@ from relay_autotune.experiment.relay_law import (
     DwellFilter,
     LoadCompensation,
     Relay,
+    Swing,
     clear_swing,
     sought_swing,
 )
@@ -489,30 +490,30 @@ class Switching:
         setup, levels = self._setup, self._setup.levels
         if not levels.searching:
             return False, None
-        half_swing, clear, y = self._last_swing()
+        swing, clear, y = self._last_swing()
         facts = self.facts
         least = sought_swing(setup.parameters, clear, facts.rest.noise_std, facts.setpoint, y)
-        if not levels.from_small and (why := levels.why_clipped(half_swing, settled=False)):
+        if not levels.from_small and (why := levels.why_clipped(swing, settled=False)):
             return False, why
-        levels.note_small(half_swing, clear)
-        factor = levels.growth_for(half_swing, least)
+        levels.note_small(swing, clear)
+        factor = levels.growth_for(swing.half, least)
         if factor is not None:
             levels.grow(factor)
             self.cycle_start = self.cycle_start[-1:]
             return True, None
-        if half_swing < least and not levels.from_small:
+        if swing.half < least and not levels.from_small:
             setup.notes.append(
-                Code.NOTE_SMALL(amplitude=levels.amplitude, swing=half_swing, least=least)
+                Code.NOTE_SMALL(amplitude=levels.amplitude, swing=swing.half, least=least)
             )
         levels.searching = False
         return False, None
 
-    def _last_swing(self) -> tuple[float, float, FloatArray]:
-        """Return half the swing over the last cycle, the least that is clear, and its samples."""
+    def _last_swing(self) -> tuple[Swing, float, FloatArray]:
+        """Return the swing of the last cycle, half of the least clear one, and its samples."""
         first, last = self.cycle_start[-2:]
-        y = self._setup.trace.columns(first, last + 1)[1]
+        time, y, _ = self._setup.trace.columns(first, last + 1)
         clear = clear_swing(self.facts.rest.noise_std, self.facts.hysteresis, y)
-        return 0.5 * float(y.max() - y.min()), clear, y
+        return Swing(0.5 * float(y.max() - y.min()), float(time[-1] - time[0])), clear, y
 
     def _cycle_that_ended(self) -> Cycle:
         setup, p, noise = self._setup, self._setup.parameters, self.facts.rest.noise_std
@@ -552,8 +553,9 @@ class Switching:
         levels = self._setup.levels
         if not (levels.from_small and self.is_tried):
             return None
-        before, last = (cycle.amplitude for cycle in self.cycles[-2:])
-        return None if last > _STILL * before else levels.why_clipped(last, settled=True)
+        before, last = (Swing(cycle.amplitude, cycle.period) for cycle in self.cycles[-2:])
+        grows = last.half > _STILL * before.half
+        return None if grows else levels.why_clipped(last, settled=True)
 
     def _only_noise(self, least: int = TELL) -> Reason | None:
         """Return why the last cycles are no oscillation, None if they may be one.
@@ -577,9 +579,9 @@ class Switching:
             return failed(noise)
         if levels.from_small and not levels.grew_enough:
             reach: dict[str, Value] = {"low": levels.low, "high": levels.high}
-            half_swing, clear, _ = self._last_swing()
+            swing, clear, _ = self._last_swing()
             # A quarter of this swing would have stood clear of the noise.
-            if not self.cycles[-1].converged or half_swing > _CLEARLY * clear:
+            if not self.cycles[-1].converged or swing.half > _CLEARLY * clear:
                 return failed(Code.REACH_UNKNOWN(**reach, **why.values))
             notes.append(Code.NOTE_REACH(**reach))
         if disturbed := sum(cycle.disturbed for cycle in self.cycles):

@@ -23,6 +23,7 @@ from relay_autotune.experiment.faults import (
     is_growing,
 )
 from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.experiment.relay_law import Levels, Swing
 from relay_autotune.identification.known import Known
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.process.structures import UNSTABLE_FOPDT, structure_named
@@ -216,6 +217,17 @@ def test_an_amplitude_that_begins_small_ends_as_it_was_given(bias, dead_time, st
     # What could not be told is said, where the noise is as large as a quarter of the swing.
     if std == 0.0:
         assert "could not be told" not in tune.reason
+
+
+def test_a_swing_that_noise_and_band_hold_grows_in_its_rate():
+    """Swings of an oven with steps of 0.25 K: the relay's band and the rounding set their size."""
+    levels = Levels(ExperimentParameters(command_min=0.0, command_max=1.0), 0.4)
+    levels.note_small(Swing(1.25, 86.9), clear=1.25)
+    levels.grow(4.0)
+    assert levels.why_clipped(Swing(1.375, 47.5), settled=False) is None
+    clipped = levels.why_clipped(Swing(1.375, 80.0), settled=False)
+    assert clipped is not None
+    assert clipped.code == Code.CLIPPED
 
 
 @pytest.mark.parametrize("dead_time", [0.1, 1.0, 10.0])
