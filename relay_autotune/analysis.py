@@ -266,10 +266,7 @@ def _chosen(record: Record, task: Task) -> _Chosen | Analysis:
     def fit(part: Record) -> Identification:
         return _guarded(part, task.method, task.known)
 
-    found = _identified((record,), lambda: fit(record))
-    if isinstance(found, Analysis):
-        return found
-    return replace(found, model=without_disturbance(found.model, record, found.cycles, fit))
+    return _identified((record,), lambda: without_disturbance(record, fit))
 
 
 def _identified(

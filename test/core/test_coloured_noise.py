@@ -14,6 +14,7 @@ from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
 from relay_autotune.analysis import analyse
+from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import NOTHING, Known
 from relay_autotune.identification.waveform.candidates import (
     Candidate,
@@ -404,3 +405,23 @@ def _thermostat(rng):
         late.append(0.0 if off else 1.0 if on else late[-1])
         command.append(late[-1])
     return Record(time=time, measurement=np.array(measured), command=np.array(command))
+
+
+def test_a_measurement_of_another_process_is_no_response():
+    time, pole = np.arange(0.0, 400.0), math.exp(-1.0 / 25.0)
+    command = np.where((time >= 60.0) & (time < 160.0) | (time >= 240.0), 1.0, 0.0)
+    process = TransferFunction.fopdt(2.0, 20.0, 6.0)
+    answer = response(process, time, PiecewiseConstant.from_samples(time, command))
+    refused, fopdt = 0, Known(structure="fopdt")
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        slow = lfilter([1.0], [1.0, -2.0 * pole, pole**2], rng.standard_normal(800))[400:]
+        slow, noise = slow / slow.std(), 0.01 * rng.standard_normal(time.size)
+        found = identify_waveform(Record(time, answer + 0.2 * slow + noise, command), fopdt)
+        assert found.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.2)
+        try:
+            identify_waveform(Record(time, slow + noise, command), fopdt)
+        except IdentificationError as error:
+            refused += "no response" in str(error)
+    # One in eight may move with the command by chance.
+    assert refused >= 7

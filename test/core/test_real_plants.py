@@ -19,7 +19,6 @@ from relay_autotune.identification.methods import identify
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Actuator, Disturbances, VirtualProcess
-from relay_autotune.record.cycles import cycles_of
 from relay_autotune.record.record import Outcome
 
 pytestmark = pytest.mark.long
@@ -56,7 +55,7 @@ def gain_of(tune, structure="fopdt"):
     def fit(part):
         return identify(part, "waveform", known)
 
-    found = without_disturbance(fit(record), record, cycles_of(record), fit)
+    found = without_disturbance(record, fit)
     return found.ultimate_gain
 
 
@@ -91,7 +90,7 @@ def test_the_end_alone_is_judged_by_what_it_leaves_beyond_the_noise(end, left_ou
         return replace(found, fit=replace(found.fit, residual_rms=times * record.noise_std))
 
     whole = leaving(1.86)
-    chosen = without_disturbance(whole, record, cycles_of(record), lambda _: leaving(end))
+    chosen = without_disturbance(record, lambda p: whole if p is record else leaving(end))
     assert any("left out" in text for text in chosen.warnings) is left_out
     assert (chosen is whole) is not left_out
 

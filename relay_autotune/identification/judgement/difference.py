@@ -27,7 +27,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.posterior import DRAWS
-from relay_autotune.identification.waveform.residuals import Colour, colour_of
+from relay_autotune.identification.waveform.residuals import Colour, colour_cost, colour_of
 from relay_autotune.process.model_set import ModelErrors
 from relay_autotune.process.response import response
 from relay_autotune.record.record import PiecewiseConstant, Record
@@ -243,8 +243,7 @@ def _in_colour(
     root = turned * (size * np.sqrt(noise[k] / (1.0 + power[k])))
     rest = left - mean @ moved
     rest = rest - np.linalg.lstsq(aside.T, white(rest), rcond=None)[0] @ nuisances
-    cost = 0.0 if colour is None else colour.log_determinant + colour.order * math.log(n)
-    return _Posterior(mean, root, rest, float(unlikely[k]) + cost)
+    return _Posterior(mean, root, rest, float(unlikely[k]) + colour_cost(colour, n))
 
 
 def _integral(u: PiecewiseConstant, at: FloatArray) -> FloatArray:

@@ -11,9 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.errors import IdentificationError, RelayAutotuneError
 from relay_autotune.identification.judgement.assessment import misfit
 from relay_autotune.identification.result import Identification
+from relay_autotune.record.cycles import cycles_of
 from relay_autotune.record.record import Cycle, Record
 
 # Ratio of residuals beyond the noise below which the end of a record alone is better.
@@ -46,31 +47,44 @@ def last_cycles(record: Record, cycles: tuple[Cycle, ...]) -> Record | None:
 
 
 def without_disturbance(
-    found: Identification,
-    record: Record,
-    cycles: tuple[Cycle, ...],
-    identify: Callable[[Record], Identification],
+    record: Record, identify: Callable[[Record], Identification]
 ) -> Identification:
-    """Identify the end of a record alone where that fits much better than the whole.
+    """Identify a record, or its end alone where that fits much better or the whole not at all.
 
-    :param found: what was identified from the whole record.
     :param record: the record.
-    :param cycles: its whole cycles.
-    :param identify: identifies a record by the same method.
+    :param identify: identifies a record by one method.
     :return: the better identification; a warning tells what it left out, and ``fitted`` is NaN
         there.
+    :raises RelayAutotuneError: of the whole record, if its end is not explained either.
     """
-    end = last_cycles(record, cycles) if misfit(found, record) > 1.0 else None
+    found: Identification | IdentificationError
+    try:
+        found = identify(record)
+        if misfit(found, record) <= 1.0:
+            return found
+        most = _BETTER * _unexplained(found, record)
+    except IdentificationError as error:
+        found, most = error, math.inf
+    alone = _of_end(record, identify)
+    if alone is not None and _unexplained(alone, record) < most:
+        return alone
+    if isinstance(found, IdentificationError):
+        raise found
+    return found
+
+
+def _of_end(record: Record, identify: Callable[[Record], Identification]) -> Identification | None:
+    """Return what the last cycles alone show; None where they show nothing."""
+    end = last_cycles(record, cycles_of(record))
     if end is None:
-        return found
+        return None
     try:
         alone = identify(end)
     except RelayAutotuneError:
-        return found
-    better = _unexplained(alone, record) < _BETTER * _unexplained(found, record)
-    if alone.loaded or not better:
+        return None
+    if alone.loaded:
         # An end that needs another load is no end after the load.
-        return found
+        return None
     left_out = len(record) - len(end)
     fitted = alone.fitted
     if len(fitted) == len(end):

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from relay_autotune.identification.waveform.residuals import Colour
+from relay_autotune.identification.waveform.residuals import Colour, colour_cost
 from relay_autotune.identification.waveform.separable import (
     NEGLIGIBLE,
     TRIAL,
@@ -188,7 +188,7 @@ class FitContext:
     @cached_property
     def _left_by_fopdt(self) -> tuple[float, float]:
         """Rms that the FOPDT leaves in simulation, and that of what it is to explain."""
-        return left_in_simulation(self.problem, self.fopdt)
+        return left_in_simulation(self.problem, self.fopdt.coefficients, self.fopdt.theta)
 
     def is_turned(self, state: Trial) -> bool:
         """Return whether a fit has not the direction of a FOPDT that explains nearly all.
@@ -208,7 +208,10 @@ class FitContext:
         :param problem: of this context, with any structure and colour.
         :param state: the fit.
         """
-        return left_in_simulation(problem, state)[0] >= self._left_by_fopdt[0]
+        return (
+            left_in_simulation(problem, state.coefficients, state.theta)[0]
+            >= self._left_by_fopdt[0]
+        )
 
     @cached_property
     def least_friction(self) -> float:
@@ -265,8 +268,7 @@ class FitContext:
     def _score(self, problem: Problem, state: Trial, model: TransferFunction) -> float:
         n = problem.time.size
         score = information_criterion(state.cost, n, state.parameters, self.floor)
-        if problem.colour is not None:
-            score += problem.colour.log_determinant + problem.colour.order * math.log(n)
+        score += colour_cost(problem.colour, n)
         imitations = sum(nuisances_of(problem))
         if not self.held:
             # A relay bounds an integrator and what grows by itself, and shows both.

@@ -11,12 +11,14 @@ took correlated samples for independent ones would prefer models that follow the
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.candidates import (
@@ -29,7 +31,12 @@ from relay_autotune.identification.waveform.candidates import (
 )
 from relay_autotune.identification.waveform.fit_covariance import Fit
 from relay_autotune.identification.waveform.rational import unit_steps
-from relay_autotune.identification.waveform.residuals import Colour, colour_of, slow_colour
+from relay_autotune.identification.waveform.residuals import (
+    Colour,
+    colour_cost,
+    colour_of,
+    slow_colour,
+)
 from relay_autotune.identification.waveform.separable import (
     NEGLIGIBLE,
     TRIAL,
@@ -37,7 +44,6 @@ from relay_autotune.identification.waveform.separable import (
     Trial,
     information_criterion,
     left_in_simulation,
-    left_of,
     refine,
 )
 from relay_autotune.process.structures import (
@@ -56,10 +62,6 @@ from relay_autotune.process.structures import (
     UNSTABLE_SOPDT,
 )
 
-NO_RESPONSE = (
-    "the measurement shows no response to the command beyond its noise: raise the amplitude, "
-    "record longer, or check that both topics belong to one loop"
-)
 # Order in which structures are fitted: first those that show which others are hopeless.
 TRIED = tuple(
     structure.name
@@ -77,17 +79,23 @@ PLAIN = (FOPDT.name, SOPDT.name)
 # little, unless the process is fast; much denser ones would favour what is faster than it.
 _FEW, _MOST = 2000, 4000
 _A_RESPONSE = 5.0
+# Samples for each response that show its form, and the least number of such lengths: of fewer
+# samples no colour of a smooth disturbance is found.
+_A_CURVE, _RESPONSES = 20.0, 3.0
 # In white noise every sample tells something; more than these change no choice.
 _MOST_WHITE = 16_384
 _MOST_TIMES = 4
+# Turns between a colour and what it leaves, and the gain in the score that ends them.
+_MOST_TURNS, _LITTLE = 20, 0.5
 # Score beyond which a structure is hopeless beside the best one: odds of e^15. The plain ones
 # never are: gains have to hold on their models, too.
 _HOPELESS = 30.0
 # Length of the record in correlation times of the slow disturbance that is tried first.
 _SLOWEST = 10.0
 _ALIKE = 0.01
-# Gain in the score that the best of all dead times and structures reaches on noise alone.
-_SEARCHED = 10.0
+# Gain in the score from which a response counts as one: odds of 20,000 to 1. The best of all dead
+# times and structures reaches half of it on the measurement of another loop.
+_ANSWERED = 20.0
 # Scores that differ by less do not tell two structures apart.
 _INDIFFERENT = 2.0
 # Mean square that a model in colour may leave, over that of the best simulation: a colour near a
@@ -129,16 +137,14 @@ def chosen_fit(
     # the simulation shows it.
     white = (few.refit(c, None) for c in own if c.problem.colour is not None)
     simulated = sorted((c for c in white if c is not None), key=lambda c: c.score)
-    for candidate in (*_by_rank(own), *_by_rank(simulated)):
-        fit = _finished(candidate, found, problem, scale)
-        if fit is not None and responds(fit.problem, fit.state):
-            return fit
-    if known.structure and responds(few.problem, few.fopdt):
-        raise IdentificationError(
-            f"no {known.structure} model explains the record; leave the structure open to have "
-            "it chosen"
-        )
-    raise IdentificationError(NO_RESPONSE)
+    fits: list[Fit] = []
+    for group in (own, simulated):
+        finished = (_finished(c, found, problem, scale) for c in _by_rank(group))
+        fits += itertools.islice((fit for fit in finished if fit is not None), 1)
+    if not fits:
+        raise no_response(known)
+    # Before a jump or without spikes the best simulation may: it shows these.
+    return next((f for f in fits if outweighs_disturbance(f.problem, f.state)), fits[-1])
 
 
 def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candidate]:
@@ -158,17 +164,77 @@ def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candid
     return sorted((c for c in again if c is not None), key=lambda c: c.score) or found
 
 
-def responds(problem: Problem, state: Trial) -> bool:
-    """Return whether a fit explains more than its parameters cost, beside drift and the like.
+def no_response(known: Known) -> IdentificationError:
+    """Return the error of a record that no response explains.
+
+    :param known: the structure, if it is known.
+    """
+    may = f", or leave the structure open: it may not be {known.structure}"
+    return IdentificationError(
+        "the measurement shows no response to the command beyond its noise and a slow "
+        "disturbance: record from a rest on, raise the amplitude, move the command more often, "
+        f"and check that both topics belong to one loop{may if known.structure else ''}"
+    )
+
+
+def outweighs_disturbance(problem: Problem, state: Trial) -> bool:
+    """Return whether a response to the command is likelier than a disturbance alone.
+
+    Each is in the colour of what it leaves. A slow disturbance explains any single slow excursion
+    of the measurement; each further change of the command that is answered adds to the odds. They
+    are asked of all samples, and of some for each response: a model that misses what is faster
+    than the loop may explain all that is slower.
 
     :param problem: what was fitted.
     :param state: its fit.
     """
+    white = replace(problem, colour=None)
+    takes = unit_steps(problem.structure, state.theta, problem.shortest)[-1]
+    some = int(_A_CURVE * max(float(np.ptp(problem.time) / takes), _RESPONSES))
+    return any(
+        _odds(white.thinned(most), state.theta, problem.colour) > _ANSWERED
+        for most in (_MOST, some)
+    )
+
+
+def _odds(problem: Problem, theta: FloatArray, colour: Colour | None) -> float:
+    """Return by how much the score of a response is better than that of a disturbance alone.
+
+    :param problem: has the samples, in white noise.
+    :param theta: of the model.
+    :param colour: in which it was fitted.
+    """
+    alone, own = _likeliest(problem, problem.nuisances(theta), None)
+    rows = problem.seen(problem.columns(theta)[0])
+    answered = min(_likeliest(problem, rows, c)[0] for c in (colour, own))
+    return alone - answered - theta.size * math.log(problem.time.size)
+
+
+def _likeliest(
+    problem: Problem, rows: FloatArray, colour: Colour | None
+) -> tuple[float, Colour | None]:
+    """Return the score of the best sum of some rows in the colour of what it leaves, and that.
+
+    :param problem: has the samples, in white noise.
+    :param rows: of any size, weighted, shape (k, n).
+    :param colour: with which to begin.
+    """
     n, floor = problem.y.size, problem.y.size * NEGLIGIBLE**2
-    nuisance = problem.nuisances(state.theta)
-    left = left_of(problem.seen(problem.y), nuisance)
-    without = information_criterion(float(left @ left), n, nuisance.shape[0], floor)
-    return information_criterion(state.cost, n, state.parameters, floor) < without - _SEARCHED
+    y, best = problem.seen(problem.y), (math.inf, colour)
+    rows = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), NEGLIGIBLE)
+    for _ in range(_MOST_TURNS):
+        whitened = replace(problem, weight=None, colour=colour)
+        seen, by = whitened.seen(y), whitened.seen(rows)
+        factors = np.linalg.lstsq(by.T, seen, rcond=None)[0]
+        left = seen - factors @ by
+        score = information_criterion(float(left @ left), n, rows.shape[0], floor)
+        score += colour_cost(colour, n)
+        if score > best[0] - _LITTLE:
+            break
+        best = score, colour
+        left = y - factors @ rows
+        colour = colour_of([left[part] for part in problem.experiments])
+    return best
 
 
 def _dense_enough(problem: Problem, sign: int, held: bool) -> FitContext:
@@ -351,7 +417,9 @@ def _simulates(candidate: Candidate, least: float) -> bool:
     :param candidate: fitted in a colour.
     :param least: mean square that the best simulation leaves.
     """
-    left, _ = left_in_simulation(candidate.problem, candidate.state)
+    left, _ = left_in_simulation(
+        candidate.problem, candidate.state.coefficients, candidate.state.theta
+    )
     return left**2 <= _WORSE * least
 
 

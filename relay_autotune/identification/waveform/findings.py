@@ -117,7 +117,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         loaded=problem.load is not None,
         play=problem.play_of(state.coefficients),
         friction=problem.dry_friction(state.coefficients),
-        to_explain=scale * left_in_simulation(problem, state)[1],
+        to_explain=scale * left_in_simulation(problem, state.coefficients, state.theta)[1],
     )
     apart = f"{math.sqrt(allowed.temper):.2g}"
     if float(apart) > 1.0:

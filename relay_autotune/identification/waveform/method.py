@@ -30,6 +30,8 @@ from relay_autotune.identification.waveform.choice import (
     TRIED,
     chosen_fit,
     names_near,
+    no_response,
+    outweighs_disturbance,
 )
 from relay_autotune.identification.waveform.findings import report
 from relay_autotune.identification.waveform.fit_covariance import (
@@ -151,6 +153,8 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
         problem, stopped = _before_stop(problem, chosen)
     fit = _by_noise(problem, chosen(problem), chosen)
     fit = _spared_of_outliers(problem, fit, known, chosen)
+    if not outweighs_disturbance(fit.problem, fit.state):
+        raise no_response(known)
     return replace(fit, warnings=(*fit.warnings, stopped)) if stopped else fit
 
 

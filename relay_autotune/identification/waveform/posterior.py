@@ -32,6 +32,7 @@ from relay_autotune.identification.waveform.separable import (
     Problem,
     Trial,
     evaluate,
+    left_by,
     left_in_simulation,
     left_of,
     refine,
@@ -61,7 +62,7 @@ _EXCLUDED = 1e-3
 # promise of the design holds on.
 _SHARE = DRAWS // 10
 # Largest excess of another model's residual over the chosen one's, as a share of the spread.
-_AS_WELL = 0.02
+_AS_WELL = 0.05
 # Mean square of two standardised deviations that 99 % of equal halves do not exceed.
 _BY_CHANCE = 4.6
 
@@ -108,7 +109,7 @@ def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: fl
     for candidate, share in zip(fit.candidates[1:], shares[1:], strict=True):
         problem, state = candidate.problem, candidate.state
         count = round(DRAWS * share)
-        if count and left_in_simulation(problem, state)[0] <= most:
+        if count and left_in_simulation(problem, state.coefficients, state.theta)[0] <= most:
             drawn = _draws(problem, state, fit.scale, inflation * temper, count, rng).models
             mixture += drawn
             models += _on_both_sides(drawn, problem, state)
@@ -153,7 +154,7 @@ def _plain(fit: Fit) -> list[TransferFunction]:
 
 def _most_left(fit: Fit) -> float:
     """Return the largest rms of a model that simulates a record as well as the chosen one."""
-    left, total = left_in_simulation(fit.problem, fit.state)
+    left, total = left_in_simulation(fit.problem, fit.state.coefficients, fit.state.theta)
     return left + _AS_WELL * total
 
 
@@ -304,7 +305,7 @@ class _Density:
         at[-1] = max(float(at[-1]), 0.0)
         far = float(np.sum(((at - self.centre) / self.deviation) ** 2))
         point = _Point(at, sign, np.empty(0), 1.0, far)
-        left = _left(self.problem, self.coefficients(point), self.theta(point))
+        left = left_by(self.problem, self.coefficients(point), self.theta(point))
         return replace(point, left=left, variance=max(self.noise(left), NEGLIGIBLE**2))
 
     def axes_at(self, point: _Point) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -424,10 +425,8 @@ def _allowed(
             values.append(read[1])
     rise = start.cost(here.variance) - here.cost(here.variance)
     excluded = rise > 2.0 * float(gammaincinv(0.5 * centre.size, 1.0 - _EXCLUDED))
-    plain, at = replace(problem, colour=None), density.theta(here)
-    left = _left(plain, density.coefficients(here), at)
-    total = left_of(plain.seen(plain.y), plain.nuisances(at))
-    explains = 2.0 * float(left @ left) < float(total @ total)
+    left, total = left_in_simulation(problem, density.coefficients(here), density.theta(here))
+    explains = 2.0 * left**2 < total**2
     return _Drawn(tuple(models), np.array(values), excluded, explains)
 
 
@@ -465,19 +464,6 @@ def _normal(count: int, size: int, rng: np.random.Generator) -> FloatArray:
     return np.stack((half, -half), axis=1).reshape(-1, size)
 
 
-def _left(problem: Problem, gain: FloatArray, theta: FloatArray) -> FloatArray:
-    """Return what a model leaves after the fit of the nuisances, shape (n,).
-
-    :param problem: the samples.
-    :param gain: coefficients of the numerator, shape (k,).
-    :param theta: shape (m,).
-    """
-    columns, _ = problem.columns(theta)
-    left = problem.y - gain @ columns[: gain.size]
-    rows = problem.seen(np.concatenate((left[None, :], columns[gain.size :])))
-    return _beside(rows[:1], rows[1:])[0]
-
-
 def _slopes(problem: Problem, gain: FloatArray, theta: FloatArray) -> FloatArray:
     """Return a model's derivatives by numerator and theta beside the nuisances, (k + m, n).
 
@@ -488,9 +474,4 @@ def _slopes(problem: Problem, gain: FloatArray, theta: FloatArray) -> FloatArray
     columns, derivatives = problem.columns(theta)
     by_theta = np.einsum("k,mkn->mn", gain, derivatives[:, : gain.size])
     own = np.concatenate((columns[: gain.size], by_theta))
-    return _beside(problem.seen(own), problem.seen(columns[gain.size :]))
-
-
-def _beside(rows: FloatArray, nuisances: FloatArray) -> FloatArray:
-    basis, _ = np.linalg.qr(nuisances.T)
-    return np.asarray(rows - (rows @ basis) @ basis.T)
+    return left_of(problem.seen(own), problem.seen(columns[gain.size :]))

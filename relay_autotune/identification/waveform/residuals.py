@@ -171,6 +171,15 @@ class Colour:
         return -2.0 * float(np.sum(np.log(self.begin.diagonal())))
 
 
+def colour_cost(colour: Colour | None, samples: int) -> float:
+    """Return what a colour adds to the Bayesian information criterion of what it whitens.
+
+    :param colour: None: white.
+    :param samples: number of samples.
+    """
+    return 0.0 if colour is None else colour.log_determinant + colour.order * math.log(samples)
+
+
 def slow_colour(pole: float) -> Colour:
     """Return the colour of a slow disturbance, an autoregression of first order.
 

@@ -477,26 +477,42 @@ def evaluate(problem: Problem, theta: FloatArray) -> Trial:
 
 
 def left_of(y: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return what the best combination of some rows leaves of a measurement, shape (n,).
+    """Return what the best combinations of some rows leave of one or several others.
 
-    :param y: shape (n,).
+    :param y: shape (..., n).
     :param rows: such as offset and drift, shape (k, n).
     """
-    return np.asarray(y - np.linalg.lstsq(rows.T, y, rcond=None)[0] @ rows)
+    factors = np.linalg.lstsq(rows.T, y.T, rcond=None)[0]
+    return np.asarray(y - factors.T @ rows)
 
 
-def left_in_simulation(problem: Problem, state: Trial) -> tuple[float, float]:
+def left_by(problem: Problem, gain: FloatArray, theta: FloatArray) -> FloatArray:
+    """Return what a model leaves, as seen, once all beside it is fitted, shape (n,).
+
+    :param problem: the samples.
+    :param gain: coefficients of the numerator, shape (k,).
+    :param theta: shape (m,).
+    """
+    columns, _ = problem.columns(theta)
+    left = problem.y - gain @ columns[: gain.size]
+    first, *beside = problem.seen(np.concatenate((left[None, :], columns[gain.size :])))
+    return left_of(first, np.array(beside))
+
+
+def left_in_simulation(
+    problem: Problem, coefficients: FloatArray, theta: FloatArray
+) -> tuple[float, float]:
     """Return the rms that a model leaves in simulation, and that of what it is to explain.
 
     All beside the model is fitted anew; the model keeps its own coefficients.
 
     :param problem: may hold other samples than those that the model was fitted to.
-    :param state: the model.
+    :param coefficients: of the model, those of the numerator first.
+    :param theta: of the model, shape (m,).
     """
-    problem, own = replace(problem, colour=None), len(problem.structure.powers)
-    columns, y = problem.seen(problem.columns(state.theta)[0]), problem.seen(problem.y)
-    left = left_of(y - state.coefficients[:own] @ columns[:own], columns[own:])
-    total = left_of(y, problem.nuisances(state.theta))
+    problem = replace(problem, colour=None)
+    left = left_by(problem, coefficients[: len(problem.structure.powers)], theta)
+    total = left_of(problem.seen(problem.y), problem.nuisances(theta))
     return math.sqrt(float(np.mean(left**2))), math.sqrt(float(np.mean(total**2)))
 
 
