@@ -92,6 +92,8 @@ def closed_loop_unstable_poles(terms: Sequence[TransferFunction]) -> float:
             return math.inf
     while not is_near(high)[0]:
         high = 2.0 * high
+        if high[0] > 1.0 / _LOWEST:
+            return math.inf
     ends = [
         np.geomspace(x, y, 2 + int(_PER_DECADE * math.log10(y / x)))
         for x, y in ((low[0], grid[0]), (grid[-1], high[0]))
@@ -227,7 +229,7 @@ _RELEVANT = 0.05
 _PER_DECADE = 50
 # Distance of a sampled loop's grid from half the sampling frequency, relative to it.
 _BEFORE_END = 1e-9
-# Below this nothing is told of how a loop begins [rad/s].
+# Below this nothing is told of how a loop begins [rad/s], nor above its inverse of how it ends.
 _LOWEST = 1e-280
 # Largest step of the phase that can be followed, and largest number of divisions of a cell.
 _FOLLOWED, _MOST_DIVISIONS = 1.0, 40
