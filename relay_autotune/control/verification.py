@@ -19,6 +19,7 @@ from relay_autotune.loop.analysis import Loop, is_stable
 from relay_autotune.loop.sampled import UNLIMITED, Limits
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code, Reason
+from relay_autotune.scalar import root
 
 # A response has settled when it stays within this part of its largest deviation.
 SETTLED = 0.05
@@ -55,7 +56,7 @@ _GAIN_SEARCH = (0.3, 3.0)
 _SLIGHTLY = 1.01
 _NODES = 20
 _NOISE_SEARCH = (1e-6, 1e2)
-_HALVINGS, _MS_HALVINGS = 30, 8
+_MS_HALVINGS = 8
 _PREDICTED_SAMPLES = 4000
 _DOUBLINGS = 8
 
@@ -287,13 +288,11 @@ def _visible(
         return float(each * (ndtr(-above).sum() + outside.sum()) + ndtr(-np.array(rare)).sum())
 
     allowed = 2.0 * float(ndtr(-NOISE_ALLOWANCE))
-    low, high = (math.log(end) for end in _NOISE_SEARCH)
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if chance(math.exp(middle)) < allowed else (low, middle)
+    ends = (math.log(end) for end in _NOISE_SEARCH)
+    most = math.exp(root(lambda ratio: chance(math.exp(ratio)) - allowed, *ends))
     # A step of this height has a response of the size of `scale`.
     height = abs(step.setpoint or step.load)
-    return height / (abs(scale) * math.exp(low))
+    return height / (abs(scale) * most)
 
 
 def _edge(control: Control, model: TransferFunction, end: float) -> float:
