@@ -9,7 +9,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.special import ndtr
 
 from relay_autotune.arrays import FloatArray
@@ -19,7 +18,7 @@ from relay_autotune.loop.analysis import Loop, is_stable
 from relay_autotune.loop.sampled import UNLIMITED, Limits
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code, Reason
-from relay_autotune.scalar import root
+from relay_autotune.scalar import minimum_near, root
 
 # A response has settled when it stays within this part of its largest deviation.
 SETTLED = 0.05
@@ -395,9 +394,8 @@ def compare(
         return float(np.mean(np.minimum(difference**2, 1e12)))
 
     predicted = predict(1.0)
-    low, high = (math.log(end) for end in _GAIN_SEARCH)
-    best = minimize_scalar(misfit, bounds=(low, high), method="bounded", options={"xatol": 1e-3})
-    ratio = math.exp(float(best.x))
+    best, _ = minimum_near(misfit, np.log(_GAIN_SEARCH), 0, 1e-3)
+    ratio = math.exp(best)
     spread = float(np.std(predicted))
     rms = math.sqrt(float(np.mean((deviation - predicted) ** 2)))
     measured = describe(time, deviation, step, noise_std)
