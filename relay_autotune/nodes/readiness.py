@@ -153,26 +153,22 @@ class Ready:
     def plan(self) -> str:
         """A sentence on the commands of the tune."""
         parameters, baseline = self.parameters, self.baseline
+        levels = Levels(parameters, baseline)
+        plan = f"relay between {levels.low:g} and {levels.high:g} about the baseline {baseline:g}"
         if parameters.finds_amplitude:
-            levels = Levels(parameters, baseline)
-            plan = (
-                f"relay between {levels.low:g} and {levels.high:g} about the baseline "
-                f"{baseline:g} at first; these grow until the oscillation is clear of the noise, "
-                f"up to {parameters.command_min:g} and {parameters.command_max:g}"
+            plan += (
+                f" at first; these grow until the oscillation is clear of the noise, up to "
+                f"{parameters.command_min:g} and {parameters.command_max:g}"
             )
-        else:
-            middle = baseline + parameters.relay_bias
-            low, high = middle - parameters.amplitude, middle + parameters.amplitude
-            plan = f"relay between {low:g} and {high:g} about the baseline {baseline:g}"
-            if self.from_small:
-                small = Levels(parameters, baseline, from_small=True)
-                plan += (
-                    f"; for the first cycle between {small.low:g} and {small.high:g}: the swing "
-                    f"has to grow with the levels if the actuator goes as far; that takes about "
-                    f"{SMALL_CYCLES} oscillations"
-                )
-                if self.period > 0.0:
-                    plan += f", {duration(SMALL_CYCLES * self.period)} by the last tune"
+        elif self.from_small:
+            small = Levels(parameters, baseline, from_small=True)
+            plan += (
+                f"; for the first cycle between {small.low:g} and {small.high:g}: the swing has "
+                f"to grow with the levels if the actuator goes as far; that takes about "
+                f"{SMALL_CYCLES} oscillations"
+            )
+            if self.period > 0.0:
+                plan += f", {duration(SMALL_CYCLES * self.period)} by the last tune"
         if self.policy.give_back:
             return f"{plan}, then back to controller_command"
         return f"{plan}, then proportional control holds the process" if self.policy.hold else plan
