@@ -215,7 +215,7 @@ def simulate_relay(
     cycles: int,
     operating_point: float | None = None,
     kick: float | None = None,
-    told: int | None = None,
+    kept: int | None = None,
 ) -> RelayRun:
     """Run an ideal relay on a process, from switch to switch, without a time step.
 
@@ -230,7 +230,7 @@ def simulate_relay(
     :param operating_point: measurement at rest [y]; default: the set-point.
     :param kick: how far above the set-point the measurement must rise before the first
         switch [y]; default: the hysteresis.
-    :param told: number of cycles to return, the last ones; default: all of them.
+    :param kept: number of cycles to return, the last ones; default: all of them.
     :raises ModelError: if the measurement never reaches a switching level, or the relay chatters.
     """
     dead_time = model.dead_time + settings.extra_delay
@@ -291,7 +291,7 @@ def simulate_relay(
                 )
     times, levels = (np.array(column) for column in zip(*switches, strict=True))
     command = PiecewiseConstant(times, levels, settings.baseline)
-    first = 0 if told is None else max(cycles - told, 0)
+    first = 0 if kept is None else max(cycles - kept, 0)
     found = tuple(_cycle(k, times, pieces, settings) for k in range(first, cycles))
     ends = np.array([piece.begin for piece in pieces[1:]] + [now])
 

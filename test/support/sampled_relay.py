@@ -103,7 +103,7 @@ def exact_limit_cycle(
     """
     count = 8
     while True:
-        run = simulate_relay(model, settings, cycles=count, told=3)
+        run = simulate_relay(model, settings, cycles=count, kept=3)
         first, second = (_change(*pair) for pair in pairwise(run.cycles[-3:]))
         last = run.cycles[-1]
         if second <= tolerance * last.period:

@@ -167,7 +167,7 @@ def _limit_cycle(
     kick = max(settings.hysteresis, kick + max(rest - settings.setpoint, 0.0))
     for count in _CYCLES:
         run = simulate_relay(
-            model, settings, cycles=count, operating_point=rest, kick=kick, told=2
+            model, settings, cycles=count, operating_point=rest, kick=kick, kept=2
         )
         a, b = run.cycles[-2], run.cycles[-1]
         change = abs(a.period_high - b.period_high) + abs(a.period_low - b.period_low)
