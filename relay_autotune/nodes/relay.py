@@ -224,7 +224,6 @@ class RelayNode(ServedNode):
                 before=self._sensor.samples.before() if present else None,
             ),
             recording,
-            sample_period=parameters.sample_period,
             clock=self._now_ns if self._simulated else None,
             repeats=self._hear is not None,
             one_clock=self._reported is not None,

@@ -45,12 +45,12 @@ class Session:
     """A relay experiment fed with the samples of a topic.
 
     The time of a sample is the first of these that applies: ``k * sample_period`` for sample k, if
-    a sample period is given; the node's clock, if it is simulated; the time of arrival, if samples
-    are repeated, so that samples and repeats are on one clock; the middleware's source stamp.
+    the experiment has a sample period; the node's clock, if it is simulated; the time of arrival,
+    if samples are repeated, so that samples and repeats are on one clock; the middleware's source
+    stamp.
 
     :param experiment: the state machine.
     :param recording: of it.
-    :param sample_period: period of the samples [s]; 0: they are stamped.
     :param clock: the simulated clock [ns]; None: time is real.
     :param repeats: True if a measurement is a sample again while the sensor is silent.
     :param one_clock: True if the stamp of a sample is the time of the command, too.
@@ -61,7 +61,6 @@ class Session:
         experiment: RelayExperiment,
         recording: Recording,
         *,
-        sample_period: float = 0.0,
         clock: Callable[[], int] | None = None,
         repeats: bool = False,
         one_clock: bool = False,
@@ -76,7 +75,7 @@ class Session:
         """Ends the experiment once an interval is narrow enough; None: not used."""
         self.lost_samples = 0
         self._step = experiment.step
-        self._period = sample_period
+        self._period = experiment.parameters.sample_period
         self._clock = clock
         self._one_clock = one_clock
         self.sample_count = 0

@@ -22,8 +22,11 @@ from relay_autotune.nodes.session import Session
 UNKEPT = SimpleNamespace(sample=lambda _: None)
 
 
-def experiment() -> RelayExperiment:
-    return RelayExperiment(ExperimentParameters(amplitude=1.0, settle_time=100.0), 0.5, "one")
+def experiment(sample_period: float = 0.0) -> RelayExperiment:
+    parameters = ExperimentParameters(
+        amplitude=1.0, settle_time=100.0, sample_period=sample_period
+    )
+    return RelayExperiment(parameters, 0.5, "one")
 
 
 def test_samples_are_timed_by_their_source_stamps() -> None:
@@ -118,7 +121,7 @@ class Lockstep:
     """A session by sample number, whose first sample was answered just now."""
 
     def __init__(self) -> None:
-        self.session = Session(experiment(), UNKEPT, sample_period=0.1)
+        self.session = Session(experiment(sample_period=0.1), UNKEPT)
         self.session.answer(7.0, time.time_ns(), None)
         self.answered_at = time.time_ns()
         self.session.answered()
