@@ -38,7 +38,7 @@ from relay_autotune.loop.gains import (
     StepFigures,
 )
 from relay_autotune.loop.law import LawRate, SampledLaw
-from relay_autotune.loop.laws import LAWS, OWN_LAW
+from relay_autotune.loop.laws import LAWS
 from relay_autotune.loop.sampled import ClosedLoop
 from relay_autotune.loop.stability import (
     closed_loop_unstable_poles,
@@ -388,18 +388,13 @@ def is_stable(controller: ControlLaw, model: TransferFunction) -> bool:
     return Loop(controller, model).unstable_poles == 0
 
 
-def analyse_loop(
-    controller: ControlLaw, model: TransferFunction, sample_period: float = 0.0
-) -> Performance:
+def analyse_loop(controller: ControlLaw, model: TransferFunction) -> Performance:
     """Return the performance of a controller on a model.
 
     :param controller: the gains, or any other linear controller.
     :param model: the process, with all dead time of the loop but that of the hold.
-    :param sample_period: at which controller_node runs the gains [s]; 0: continuous.
     :raises TuningError: if the closed loop is unstable, or its responses do not die away.
     """
-    if sample_period > 0.0 and isinstance(controller, Controller):
-        controller = LAWS[OWN_LAW].at(controller, sample_period)
     return Loop(controller, model).performance()
 
 

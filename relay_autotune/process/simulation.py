@@ -129,13 +129,11 @@ _QUADRATURE = np.polynomial.legendre.leggauss(8)
 class RelayRun:
     """Result of an ideal relay experiment.
 
-    :param settings: the relay.
     :param command: the command with its exact switch instants.
     :param cycles: every whole cycle, with exact times and peaks.
     :param output: returns the noise-free measurement at instants of the run [y].
     """
 
-    settings: RelaySettings
     command: PiecewiseConstant
     cycles: tuple[Cycle, ...]
     output: Callable[[FloatArray], FloatArray]
@@ -301,7 +299,7 @@ def simulate_relay(
             y[number == k] = pieces[k].output(at[number == k] - pieces[k].begin)
         return y
 
-    return RelayRun(settings, command, found, output)
+    return RelayRun(command, found, output)
 
 
 def _no_delay(time: float) -> ModelError:

@@ -18,6 +18,7 @@ from scipy.integrate import trapezoid
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop, analyse_loop, is_stable
 from relay_autotune.loop.gains import Controller, InternalModelLaw
+from relay_autotune.loop.laws import LAWS, OWN_LAW
 from relay_autotune.loop.stability import closed_loop_unstable_poles, winding
 from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.structures import (
@@ -233,7 +234,7 @@ def test_the_error_of_a_loop_that_runs_far_faster_than_it_answers_is_the_continu
     model, gains = TransferFunction.fopdt(2.0, 1e4, 3e3), Controller(0.8, 9e3)
     continuous = analyse_loop(gains, model).iae_setpoint
     for period in (1.0, 1e-3, 1e-6):
-        found = analyse_loop(gains, model, period).iae_setpoint
+        found = analyse_loop(LAWS[OWN_LAW].at(gains, period), model).iae_setpoint
         assert found == pytest.approx(continuous, rel=1e-3)
 
 

@@ -72,7 +72,7 @@ def test_the_noise_in_the_command_is_what_was_predicted(period):
             gains, MODEL, period=period, duration=3000 * period, noise=noise
         )
         assert np.std(run.command[400:]) == pytest.approx(
-            analyse_loop(gains, MODEL, period).noise_gain, rel=0.06
+            analyse_loop(LAWS[OWN_LAW].at(gains, period), MODEL).noise_gain, rel=0.06
         )
 
 

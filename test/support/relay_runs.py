@@ -22,9 +22,11 @@ from relay_autotune.record.record import Outcome, Record, RelaySettings
 class RelayRun(simulation.RelayRun):
     """An ideal relay experiment, sampled.
 
+    :param settings: the relay.
     :param time: sample times [s], shape (n,).
     """
 
+    settings: RelaySettings
     time: FloatArray
 
     @cached_property
@@ -76,4 +78,5 @@ def simulate_relay(
     run = simulation.simulate_relay(model, settings, **options)
     end = float(run.command.times[-1])
     samples = np.linspace(0.0, end, time) if isinstance(time, int) else np.asarray(time)
-    return RelayRun(**vars(run), time=samples[(samples >= 0.0) & (samples <= end)])
+    inside = samples[(samples >= 0.0) & (samples <= end)]
+    return RelayRun(**vars(run), settings=settings, time=inside)
