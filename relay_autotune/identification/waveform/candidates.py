@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.residuals import Colour, colour_cost
 from relay_autotune.identification.waveform.separable import (
     NEGLIGIBLE,
@@ -321,8 +322,12 @@ class FitContext:
             return state
         if problem.structure == FOPDT:
             return fopdt
-        starts = Guess.of(beside, fopdt).starts(problem.structure)
+        starts = self._starts(Guess.of(beside, fopdt), problem.structure)
         return min(state, best_of(problem, starts), key=lambda s: s.cost)
+
+    def _starts(self, guess: Guess, structure: Structure) -> list[FloatArray]:
+        growing = math.exp(float(self.unstable.theta[0])) if structure.unstable else math.nan
+        return guess.starts(structure, growing)
 
     def _fopdt_of(self, problem: Problem) -> Trial:
         """Return the best fit of a FOPDT with some terms, found once for the same samples.
@@ -449,11 +454,10 @@ class FitContext:
         problem = replace(self.problem, structure=structure)
         if structure == UNSTABLE_FOPDT:
             return self.unstable
-        growing = math.exp(float(self.unstable.theta[0])) if structure.unstable else math.nan
         if structure == IPDT:
             # A command off its balance leaves a drift, which is a term of its own.
             least = math.inf
-        return multistart(problem, self.guess.starts(structure, growing), least)
+        return multistart(problem, self._starts(self.guess, structure), least)
 
 
 def nuisances_of(problem: Problem, terms: Iterable[str] = TERMS) -> tuple[bool, ...]:

@@ -385,7 +385,7 @@ class Guess:
         phase = w * self.dead_time + math.atan(w * self.tau) - order * math.atan(w * tau)
         return tau, max(phase / w, self.shortest)
 
-    def starts(self, structure: Structure, growing: float = math.nan) -> list[FloatArray]:
+    def starts(self, structure: Structure, growing: float) -> list[FloatArray]:
         """Return starts of a structure: all its lags alike, or one slow and the others fast.
 
         The slow one is the FOPDT's, an integrator or what grows; the fast ones take their share
