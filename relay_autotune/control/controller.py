@@ -291,14 +291,26 @@ class Control:
         return self.gains if self.rate is None else self.rate.of(self.gains)
 
 
+@dataclass(frozen=True)
+class Step:
+    """A step of a closed loop.
+
+    :param setpoint: height of the set-point's step, at the first sample [y]; 0: none.
+    :param load: height of the step added to the command [u]; 0: none.
+    :param load_time: when that enters, after the first sample [s].
+    """
+
+    setpoint: float = 0.0
+    load: float = 0.0
+    load_time: float = 0.0
+
+
 def run_loop(
     control: Control,
     model: TransferFunction,
     time: FloatArray,
+    step: Step,
     *,
-    setpoint: float = 0.0,
-    load: float = 0.0,
-    load_time: float = 0.0,
     limits: Limits = UNLIMITED,
     noise: FloatArray | None = None,
 ) -> ClosedLoop:
@@ -307,9 +319,7 @@ def run_loop(
     :param control: the controller.
     :param model: the process.
     :param time: instants of the samples [s], increasing, the first at the step, shape (n,).
-    :param setpoint: step of the set-point [y].
-    :param load: step added to the command [u].
-    :param load_time: when it enters, after the first sample [s].
+    :param step: what moves it.
     :param limits: range of the command, as deviations [u].
     :param noise: on the measurement at each run of the controller [y], shape (n,); None: none.
     """
@@ -330,8 +340,8 @@ def run_loop(
         for n in range(done, until[k]):
             run = float(runs[n])
             y = plant.advance(run, applied)
-            applied = controller.step(run, setpoint, float(y + seen[n]))
-            applied += load if run + interval > load_time else 0.0
+            applied = controller.step(run, step.setpoint, float(y + seen[n]))
+            applied += step.load if run + interval > step.load_time else 0.0
         done = until[k]
         if runs[done - 1] != t:
             y = plant.advance(float(t), applied)
@@ -384,9 +394,7 @@ def simulate_closed_loop(
         control,
         model,
         time,
-        setpoint=setpoint,
-        load=load,
-        load_time=load_time,
+        Step(setpoint, load, load_time),
         limits=Limits(low, high),
         noise=noise,
     )

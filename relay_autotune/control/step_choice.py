@@ -11,11 +11,10 @@ from functools import cached_property
 
 import numpy as np
 
-from relay_autotune.control.controller import Control
+from relay_autotune.control.controller import Control, Step
 from relay_autotune.control.verification import (
     NOISE_ALLOWANCE,
     Plan,
-    Step,
     least_text,
     plan,
     rounded_up,

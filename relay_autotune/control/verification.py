@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.control.controller import Control, run_loop, scaled
+from relay_autotune.control.controller import Control, Step, run_loop, scaled
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop, is_stable
 from relay_autotune.loop.sampled import UNLIMITED, Limits
@@ -58,18 +58,6 @@ _NOISE_SEARCH = (1e-6, 1e2)
 _MS_HALVINGS = 8
 _PREDICTED_SAMPLES = 4000
 _DOUBLINGS = 8
-
-
-@dataclass(frozen=True)
-class Step:
-    """A step of a closed loop.
-
-    :param setpoint: height of the set-point's step [y]; 0: none.
-    :param load: height of the step added to the command [u]; 0: none.
-    """
-
-    setpoint: float = 0.0
-    load: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -211,7 +199,7 @@ def plan(
         if rate is not None:
             interval = max(period, min(interval, rate.period))
         time = np.arange(int(horizon / interval) + 2, dtype=np.float64) * interval
-        run = run_loop(control, model, time, setpoint=step.setpoint, load=step.load)
+        run = run_loop(control, model, time, step)
         response = describe(time, run.measurement, step)
         if response.settling_time < 0.6 * horizon:
             duration = max(WATCHED * response.settling_time, LEAST_SAMPLES * period)
@@ -251,9 +239,7 @@ def _visible(
     deviation = predicted[: time.size]
     expected = describe(time, deviation, step)
     scale = step.setpoint or expected.largest
-    other = run_loop(
-        control, scaled(model, _SLIGHTLY), time, setpoint=step.setpoint, load=step.load
-    ).measurement
+    other = run_loop(control, scaled(model, _SLIGHTLY), time, step).measurement
     slope = float(np.sum(((other - deviation) / math.log(_SLIGHTLY) / scale) ** 2))
     interval = float(np.median(np.diff(time)))
     # Samples for each instant of the prediction.
@@ -379,14 +365,7 @@ def compare(
     """
 
     def predict(factor: float) -> FloatArray:
-        run = run_loop(
-            control,
-            scaled(model, factor),
-            time,
-            setpoint=step.setpoint,
-            load=step.load,
-            limits=limits,
-        )
+        run = run_loop(control, scaled(model, factor), time, step, limits=limits)
         return run.measurement
 
     def misfit(log_factor: float) -> float:

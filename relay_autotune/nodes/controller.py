@@ -22,9 +22,8 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool, Trigger
 
-from relay_autotune.control.controller import is_usable, running
+from relay_autotune.control.controller import Step, is_usable, running
 from relay_autotune.control.gains_history import GainSet
-from relay_autotune.control.verification import Step
 from relay_autotune.errors import (
     FieldError,
     NotReadyError,

@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 import numpy as np
 from rclpy.task import Future
 
-from relay_autotune.control.controller import LONGEST_TIME, Control
+from relay_autotune.control.controller import LONGEST_TIME, Control, Step
 from relay_autotune.control.gains_history import GainSet
-from relay_autotune.control.verification import SETTLES, Plan, Step, compare, plan
+from relay_autotune.control.verification import SETTLES, Plan, compare, plan
 from relay_autotune.errors import NotReadyError, RelayAutotuneError
 from relay_autotune.exchange.fields import float64_array
 from relay_autotune.exchange.messages import fill_reason, reason_from_message, set_stamp

@@ -18,10 +18,11 @@ from relay_autotune.control.controller import (
     Control,
     LawController,
     PidController,
+    Step,
     run_loop,
     simulate_closed_loop,
 )
-from relay_autotune.control.verification import Step, compare, plan
+from relay_autotune.control.verification import compare, plan
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
@@ -386,7 +387,7 @@ def test_a_step_of_a_law_is_predicted_as_its_source_makes_it(name):
     there = np.delete(np.arange(0, time.size, 3), 4)
     elsewhere = replace(control, elsewhere=True)
     plan(elsewhere, PROCESS, step, 3.0 * PERIOD)
-    heard = run_loop(elsewhere, PROCESS, time[there], setpoint=step.setpoint)
+    heard = run_loop(elsewhere, PROCESS, time[there], step)
     assert heard.measurement == pytest.approx(seen[there], abs=1e-6)
 
 

@@ -15,10 +15,9 @@ import pytest
 from fopdt_plant import FopdtPlant
 from scipy.integrate import solve_ivp
 
-from relay_autotune.control.controller import Control, GainBounds, PidController, run_loop
+from relay_autotune.control.controller import Control, GainBounds, PidController, Step, run_loop
 from relay_autotune.control.step_choice import StepChoice, StepRange
 from relay_autotune.control.verification import (
-    Step,
     compare,
     describe,
     noise_of,
@@ -139,8 +138,8 @@ def test_jitter_changes_little():
     steady = np.arange(400) * 0.05
     shaken = steady + np.append(0.0, rng.uniform(0.0, 0.02, 399))
     gains = Controller(kc=1.2, ti=2.0, td=0.1, tf=0.05)
-    exact = run_loop(Control(gains), PROCESS, steady, setpoint=1.0)
-    other = run_loop(Control(gains), PROCESS, shaken, setpoint=1.0)
+    exact = run_loop(Control(gains), PROCESS, steady, Step(setpoint=1.0))
+    other = run_loop(Control(gains), PROCESS, shaken, Step(setpoint=1.0))
     at = np.interp(steady, shaken, other.measurement)
     assert np.abs(at - exact.measurement).max() < 0.03
 
@@ -151,7 +150,7 @@ def test_jitter_changes_little():
 def measured(process, step, noise_std=0.0, gains=GAINS, period=0.05):
     wanted = plan(Control(gains), PROCESS, step, period, noise_std)
     time = np.arange(int(wanted.duration / period)) * period
-    run = run_loop(Control(gains), process, time, setpoint=step.setpoint, load=step.load)
+    run = run_loop(Control(gains), process, time, step)
     noise = noise_std * np.random.default_rng(4).standard_normal(time.size)
     return time, run.measurement + noise
 
@@ -305,9 +304,7 @@ def test_the_least_step_is_where_the_noise_begins_to_decide(step, less):
 
     def failures(height: float, count: int) -> Iterator[bool]:
         made = replace(step, setpoint=height * step.setpoint, load=height * step.load)
-        response = run_loop(
-            tried, PROCESS, time, setpoint=made.setpoint, load=made.load
-        ).measurement
+        response = run_loop(tried, PROCESS, time, made).measurement
         noisy = (response + rng.normal(size=time.size) for _ in range(count))
         return (not compare(tried, PROCESS, made, time, y, noise_std=1.0).passed for y in noisy)
 

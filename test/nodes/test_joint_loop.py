@@ -21,7 +21,8 @@ from relay_autotune.cli import joint_tune
 from relay_autotune.cli.joint_tune import JointLoop
 from relay_autotune.cli.loops import Loop
 from relay_autotune.cli.settings import Answers
-from relay_autotune.control.verification import Step, compare
+from relay_autotune.control.controller import Step
+from relay_autotune.control.verification import compare
 from relay_autotune.errors import LoopError
 from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.loop import laws

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from relay_autotune.control.controller import Control, GainBounds, run_loop
+from relay_autotune.control.controller import Control, GainBounds, Step, run_loop
 from relay_autotune.control.gains_history import GainSet
-from relay_autotune.control.verification import Step, plan
+from relay_autotune.control.verification import plan
 from relay_autotune.errors import NotReadyError, TuningError
 from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
@@ -81,7 +81,7 @@ def test_a_sensor_that_is_too_coarse_for_a_step_gives_no_verdict() -> None:
     tried = Verifiable([step], None, math.nan, Control(gains), model, UNLIMITED)
     planned, rest = plan(Control(gains), model, step, 0.05), Rest(5.0, 1.0, 0.0)
     time = np.arange(0.0, planned.duration, 0.05)
-    exact = 5.0 + run_loop(Control(gains), model, time, setpoint=0.01).measurement
+    exact = 5.0 + run_loop(Control(gains), model, time, Step(setpoint=0.01)).measurement
 
     def seen(resolution: float) -> Any:
         y = np.round(exact / resolution) * resolution
