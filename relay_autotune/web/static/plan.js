@@ -86,7 +86,11 @@ export class Plan {
     if (!this.form) {
       this.form = form;
       this.showForm();
-      if (!this.typed()) { this.ask(); return; }
+      if (!this.typed()) {
+        this.ask();
+        [...$("form").querySelectorAll("input")].find((input) => input.value === "").focus();
+        return;
+      }
     }
     this.say(refusal || "Nothing moves before you agree; it can be ended at any time.", lines, !refusal, Boolean(refusal), refused);
   }
