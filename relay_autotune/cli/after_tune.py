@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.bag.definitions import FLOAT64
-from relay_autotune.cli.apply_gains import found_entries
 from relay_autotune.cli.arguments import as_typed, say
 from relay_autotune.cli.loops import Steps
 from relay_autotune.cli.own_nodes import PROGRAM, ros_arguments
@@ -62,7 +61,7 @@ from relay_autotune.text import digits
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
-    pass
+    from relay_autotune.report.case import Case
 
 # Relative difference of gains that are the same.
 _NEAR = 1e-6
@@ -92,6 +91,9 @@ class AfterTune(Tuned):
     """
 
     parser: argparse.ArgumentParser
+    # What the report shows, and what a proof has found.
+    _case: Case | None = None
+    _proof: tuple[tuple[str, str], ...] = ()
 
     # The result.
 
@@ -114,6 +116,7 @@ class AfterTune(Tuned):
             steps: Steps = []
             if self.loop.has_own_nodes and self.has_gains:
                 proven, steps = self.hand_over()
+                self._report_proof()
             steps += next_commands(result, controllers, flags, report)
             steps += self.repeated(proven)
             if steps:
@@ -207,6 +210,7 @@ class AfterTune(Tuned):
                 again += f" --present {present.kc:.6g} {present.ti:.6g} {present.td:.6g}"
             case = replace(case, command=f"{again} -o {shlex.quote(output)}")
         write_report([case], output)
+        self._case = case
         gains, published = found.best_gains, result.gains
         kc = gains.kc if gains is not None else math.nan
         if not published.experiment_id or math.isclose(kc, published.kc, rel_tol=_NEAR):
@@ -215,6 +219,18 @@ class AfterTune(Tuned):
             f"the report has kc {kc:.6g} where the identifier_node gave {published.kc:.6g}: "
             "the node had other parameters, or is of another version"
         )
+
+    def _report_proof(self) -> None:
+        """Write the report again, with the proof: one that is cut short leaves it without."""
+        if self._case is None or not self._proof:
+            return
+        from relay_autotune.cli.report import write_report
+
+        with Working("writing the proof into the report"):
+            try:
+                write_report([replace(self._case, proof=self._proof)], self.options.report)
+            except RelayAutotuneError as error:
+                say(PROGRAM, f"the report lacks the proof: {error}")
 
     # The gains.
 
@@ -375,7 +391,8 @@ class AfterTune(Tuned):
         with noted(lambda text: say(PROGRAM, text)) as (shown, leave):
             found = proof.made(step, bool(self.doubt), shown, leave)
         print()
-        for entry in found_entries(found):
+        self._proof = proof.entries(found)
+        for entry in self._proof[1:]:
             tell(*entry)
         if proof.rate is not None:
             tell(

@@ -22,7 +22,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from relay_autotune.analysis import options_from
-from relay_autotune.cli.apply_gains import found_entries, verified
+from relay_autotune.cli.apply_gains import verified
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, say, worst
 from relay_autotune.cli.loops import Loop
 from relay_autotune.cli.own_nodes import PROGRAM
@@ -37,7 +37,7 @@ from relay_autotune.cli.tune_view import (
     estimate,
     oscillation,
 )
-from relay_autotune.cli.tuned import CONTROLLER, Proof, Tuned
+from relay_autotune.cli.tuned import CONTROLLER, Proof, Tuned, gains_words
 from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError, TuningError
 from relay_autotune.exchange.messages import (
     fill_gains,
@@ -48,13 +48,12 @@ from relay_autotune.exchange.messages import (
 )
 from relay_autotune.experiment.early_end import ULTIMATE_GAIN
 from relay_autotune.identification.result import Identification
-from relay_autotune.loop.gains import Controller, Gains
+from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.gains_client import GainsClient, StepsHere
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.report.case import Case, EstimatedQuantity, case_of, ultimate_of
 from relay_autotune.result import Analysis
-from relay_autotune.text import digits
 from relay_autotune.verdict import Verdict
 from relay_autotune.web.address import address_of
 from relay_autotune.web.live import (
@@ -415,7 +414,8 @@ class _LoopOnPage:
 
         def completed() -> None:
             every = shown(tune.analysed())
-            subject.case = replace(every, present=subject.case.present)
+            known = subject.case
+            subject.case = replace(every, present=known.present, proof=known.proof)
             self._page.changed()
 
         # The recommended gains may be used meanwhile.
@@ -499,7 +499,7 @@ class GainsPage:
         except RelayAutotuneError:
             # It may be about to end: the next look tells.
             return
-        self.live.tell(controller=controller.name, present=_said(present))
+        self.live.tell(controller=controller.name, present=gains_words(present))
         for subject in self.page.subjects:
             if subject.loop == self.number and subject.case.present != present:
                 subject.case = replace(subject.case, present=present)
@@ -547,7 +547,7 @@ class GainsPage:
             yield "", "now", f"{self.live.told.controller} has {self.live.told.present}"
             after = "; at once, without a bump of the command"
         if message is not None:
-            yield "", "gains", f"{_said(gains_from_message(message))}{after}"
+            yield "", "gains", f"{gains_words(gains_from_message(message))}{after}"
             if message.verdict != PidGains.VERDICT_TRUSTED:
                 yield "note", "doubtful", message.verdict_reason
         if wish.what == REVERT:
@@ -606,7 +606,7 @@ class GainsPage:
         message = self._message(wish)
         steps = None if wish.what == APPLY else self._steps(message)
         if isinstance(steps, Proof):
-            self._prove(steps, wish, message)
+            self._prove(steps, wish)
             return
         controller = self._found()
         with controller.accepting_doubtful() if wish.doubtful else nullcontext():
@@ -620,7 +620,7 @@ class GainsPage:
             with controller.offered(message) if message else nullcontext() as gains:
                 self._verify(controller, step, gains)
 
-    def _prove(self, proof: Proof, wish: PageCommand, message: Any) -> None:
+    def _prove(self, proof: Proof, wish: PageCommand) -> None:
         """Prove gains by a controller_node of the command, which ends after it."""
         live, step = self.live, wish.step or proof.step
         proof.allowed.require(step)
@@ -629,8 +629,11 @@ class GainsPage:
             step, wish.doubtful, lambda text: live.tell(status=text), self.leave, self._show_steps
         )
         left = f"; the command stands at {self.loop.options.at:.6g} u"
-        gains = ("gains", f"{_said(gains_from_message(message))}, at {time.strftime('%H:%M')}")
-        self._rest("proof", result, [gains, *found_entries(result)], left)
+        entries = proof.entries(result)
+        if result.steps:
+            subject = self.page.subjects[wish.of]
+            subject.case = replace(subject.case, proof=entries)
+        self._rest("proof", result, entries, left)
 
     def _verify(self, controller: GainsClient, step: float, new: Controller | None) -> None:
         live = self.live
@@ -681,16 +684,6 @@ class GainsPage:
         message = PidGains()
         fill_gains(message, gains, experiment_id=subject.case.experiment_id, judgement=judgement)
         return message
-
-
-def _said(gains: Controller | None) -> str:
-    if gains is None:
-        return "no gains; its command is held"
-    told = f"kc {digits(gains.kc)} u/y, ti {digits(gains.ti)} s, td {digits(gains.td)} s"
-    if isinstance(gains, Gains) and gains.law:
-        # Under another law the same numbers are other gains.
-        told += f", {gains.law} every {gains.law_period:g} s"
-    return told
 
 
 def _document(step: Any) -> dict[str, Any]:

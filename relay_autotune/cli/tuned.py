@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import math
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+from relay_autotune.cli.apply_gains import found_entries
 from relay_autotune.cli.arguments import exit_status
 from relay_autotune.cli.loops import PATIENCE
 from relay_autotune.cli.own_nodes import START_WITHIN, ros_arguments
@@ -27,12 +29,12 @@ from relay_autotune.control.step_choice import StepChoice, StepRange
 from relay_autotune.control.verification import SETTLES, noise_of
 from relay_autotune.errors import TuningError
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
-from relay_autotune.loop.gains import Gains
+from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes.gains_client import GainsClient
 from relay_autotune.nodes.tables import parameters_of_law, rate_of
 from relay_autotune.record.record import Record
-from relay_autotune.text import duration
+from relay_autotune.text import digits, duration
 from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -263,3 +265,22 @@ class Proof:
                 controller.let_settle(self._settles, tell, "the loop goes back", leave)
             show(controller.steps_of(found))
         return found
+
+    def entries(self, result: Any) -> tuple[tuple[str, str], ...]:
+        """Return what a proof of now has found, and of which gains: names and texts.
+
+        :param result: the `Verify.Result`.
+        """
+        gains = f"{gains_words(gains_from_message(self._message))}, at {time.strftime('%H:%M')}"
+        return ("gains", gains), *found_entries(result)
+
+
+def gains_words(gains: Controller | None) -> str:
+    """Return gains in words."""
+    if gains is None:
+        return "no gains; its command is held"
+    told = f"kc {digits(gains.kc)} u/y, ti {digits(gains.ti)} s, td {digits(gains.td)} s"
+    if isinstance(gains, Gains) and gains.law:
+        # Under another law the same numbers are other gains.
+        told += f", {gains.law} every {gains.law_period:g} s"
+    return told

@@ -87,6 +87,7 @@ class Case:
     :param added_delay: dead time that the controller's loop adds to the process [s].
     :param judgement: what the checks found, and the verdict.
     :param present: the gains that are in the controller now; None: not known.
+    :param proof: what a step has shown of gains: names and texts; empty: none was made.
     :param units: of the measurement, by "y", and of the command, by "u", as far as known.
     :param command: the command line that made the report; empty: not known.
     :param truth: the true process, if it was simulated.
@@ -112,6 +113,7 @@ class Case:
     added_delay: float = 0.0
     judgement: Judgement = NOT_JUDGED
     present: Controller | None = None
+    proof: tuple[tuple[str, str], ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
     command: str = ""
     truth: TransferFunction | None = None

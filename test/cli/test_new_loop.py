@@ -55,6 +55,8 @@ from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code
+from relay_autotune.record.record import Outcome
+from relay_autotune.report.case import Case
 from relay_autotune.text import in_units
 from relay_autotune.tuning import design
 from relay_autotune.tuning.task import DesignOptions, DesignTask
@@ -1084,6 +1086,22 @@ def test_the_present_command_is_asked_about_as_it_was_given_and_not_as_measured(
     answers.measured = 5.0
     assert answers.now("within") == "5 y now"
     assert answers.now("command_within") == answers.now("at") == "the present one given as 40 u"
+
+
+def test_a_report_is_written_again_with_the_proof_and_stays_where_none_was_made(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    written: list[Any] = []
+    monkeypatch.setattr(
+        "relay_autotune.cli.report.write_report",
+        lambda cases, output: written.append((cases[0].proof, output)),
+    )
+    case = Case("tank", "x", 0.0, 9.0, Outcome.COMPLETED, "")
+    loop: Any = SimpleNamespace(client=None, options=SimpleNamespace(report="tune.html"))
+    proof = (("verdict", "passed"),)
+    for known, made in ((case, ()), (None, proof), (case, proof)):
+        AfterTune(loop, tune_loop._parser(), known, made)._report_proof()
+    assert written == [(proof, "tune.html")]
 
 
 def test_a_joint_whose_model_was_cancelled_is_said_to_have_its_reference(

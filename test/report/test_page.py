@@ -365,6 +365,16 @@ def test_what_a_controller_may_lack_may_be_left_out(monkeypatch) -> None:
     assert "leave out" not in text
 
 
+def test_a_proof_that_was_made_is_told(monkeypatch) -> None:
+    only(monkeypatch)
+    case = case_of(completed(), "tank")
+    assert "Proof by a step" not in read(page([case])).text
+    proof = (("gains", "kc 0.5861 u/y, at 13:14"), ("verdict", f"passed {HOSTILE}"))
+    found = read(page([replace(case, proof=proof)]))
+    assert "Proof by a step of the set-point" in found.text
+    assert "kc 0.5861 u/y, at 13:14" in found.text and f"passed {HOSTILE}" in found.text
+
+
 def test_the_present_gains_stand_beside_the_new_ones_with_what_both_do(monkeypatch) -> None:
     only(monkeypatch)
     case = case_of(completed(), "tank")

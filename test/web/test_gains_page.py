@@ -11,14 +11,18 @@ import pytest
 from analysed import analysed_once
 from served import analysed, subject_of
 
+from relay_autotune.cli import tune_page
 from relay_autotune.cli.tune_page import GainsPage
+from relay_autotune.cli.tuned import Proof
+from relay_autotune.control.step_choice import StepRange
 from relay_autotune.errors import TuningError
 from relay_autotune.exchange.messages import gains_from_message
 from relay_autotune.record.record import Outcome
 from relay_autotune.verdict import Judgement
 from relay_autotune.web.live import Live, PageCommand
 from relay_autotune.web.shape import DesignRequest
-from relay_autotune_msgs.msg import PidGains
+from relay_autotune_msgs.action import Verify
+from relay_autotune_msgs.msg import PidGains, Verification
 
 CALM = PageCommand("apply", 0, DesignRequest(controller="pi", ms=1.3), 0.0)
 
@@ -91,3 +95,46 @@ def test_a_proof_that_is_refused_leaves_the_one_that_has_passed():
     gains.do(replace(CALM, what="prove"))
     assert "no gains of a tune" in live.told.status
     assert live.told.proof == passed and live.everything()["shown"] == {"proof": [1]}
+
+
+def test_a_proof_is_in_the_report_of_its_gains_and_is_computed_once(monkeypatch):
+    subject, live = subject_of(analysed()), Live("/relay_node")
+    worker = SimpleNamespace(ask=lambda work: ThreadPoolExecutor(1).submit(work))
+    client = SimpleNamespace(wait=lambda is_done, patience: [None for _ in iter(is_done, True)])
+    options = SimpleNamespace(at=2.0)
+    loop = SimpleNamespace(client=client, proves=True, options=options)
+    page = SimpleNamespace(subjects=[subject], worker=worker)
+    gains = GainsPage(loop, live, page, 0, lambda: False)
+    asked, computed = list[float](), []
+    made = Verification(step=0.5, overshoot=0.1, settling_time=3.8)
+
+    class Made(Proof):
+        step = 0.5
+        allowed = StepRange(-1.0, 1.0)
+
+        def __init__(self, tune, message):
+            self._message = message
+            computed.append(message)
+
+        def plan(self, step):
+            self.allowed.require(step)
+            return (("moves", f"by {step:+g} y"),)
+
+        def made(self, step, doubtful, tell, leave, show):
+            asked.append(step)
+            return Verify.Result(passed=True, reason="numbers", steps=[made])
+
+    monkeypatch.setattr(tune_page, "Proof", Made)
+    gains._tuned = object()
+    wish = replace(CALM, what="prove")
+    plan = gains.plan(replace(wish, dry=1))
+    assert ("", "moves", "by +0.5 y") in plan.lines and plan.form[0]["values"] == [0.5]
+    refused = gains.plan(replace(wish, dry=2, step=3.0))
+    assert "expected from -1 to 1 y" in refused.refusal and refused.refused == "step"
+    gains.do(replace(wish, step=-0.7))
+    # computed once, for two plans and the proof itself
+    assert (asked, len(computed)) == ([-0.7], 1)
+    assert live.told.status.startswith("proof passed")
+    names = dict(subject.case.proof)
+    assert names["gains"].startswith(f"kc {subject.shaped(CALM.asked).gains.kc:.4f}")
+    assert names["verdict"].startswith("passed") and subject.case.proof == live.told.proof
