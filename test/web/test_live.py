@@ -246,7 +246,7 @@ def test_an_open_page_draws_so_many_points_at_most_and_none_while_it_is_hidden(t
         x, y = np.array(points, float).T
         assert 1000 <= x.size <= 2000
         # All from the left end of the figure on, in their order.
-        assert x[0] == x.min() == 54.0
+        assert x[0] == x.min() == 62.0
         assert np.all(np.diff(y) <= 0.0)
         assert np.ptp(y) > 150.0
         hidden("true")
@@ -257,6 +257,25 @@ def test_an_open_page_draws_so_many_points_at_most_and_none_while_it_is_hidden(t
         assert tab.eval("document.body.dataset.measured") == before
         hidden("false")
         tab.wait(f"Number(document.body.dataset.measured) >= {newest() - 1e-3}")
+
+
+@pytest.mark.browser
+def test_long_numbers_of_a_figure_do_not_run_into_the_title_of_its_axis(tmp_path):
+    live = Live("/relay_node")
+    with Chromium(tmp_path) as browser, served([], live=live) as url:
+        tab = browser.tab(url)
+        tab.wait("document.body.dataset.phase === 'idle'")
+        for k in range(100):
+            live.sample("measurement", 39.66 + 0.00007 * k)
+        tab.wait("document.querySelectorAll('#plot-live-measurement .tick').length > 4")
+        box = "each.getBoundingClientRect()"
+        ticks = tab.eval(
+            "[...document.querySelectorAll('#plot-live-measurement .tick[text-anchor=end]')]"
+            f".map((each) => [each.textContent, {box}.left])"
+        )
+        title = "[...document.querySelectorAll('#plot-live-measurement .axis')].at(-1)"
+        assert max(len(text) for text, _ in ticks) >= 6
+        assert tab.eval(f"(each => {box}.right)({title})") < min(at for _, at in ticks)
 
 
 @pytest.mark.browser

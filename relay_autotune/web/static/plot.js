@@ -72,7 +72,7 @@ export class Plot {
     const width = Math.round(this.host.clientWidth);
     if (!what || width < 60) return;
     const height = what.square ? Math.min(width, 430) : Math.round(Math.min(260, 0.5 * width + 60));
-    const left = 54, right = 10, top = 8, below = this.words.x ? 36 : 20;
+    const right = 10, top = 8, below = this.words.x ? 36 : 20;
     const curves = what.curves || [];
     const bands = what.bands || [];
     const marks = what.marks || [];
@@ -81,6 +81,9 @@ export class Plot {
     const ys = what.ys || range(
       [...curves.map((c) => c.y), ...bands.map((b) => b.low), ...bands.map((b) => b.high),
         marks.map((m) => m.y)]);
+    const levels = ticks(ys[0], ys[1], height / 50).map((y) => [y, String(y)]);
+    // Room for the numbers beside the axis's title; figures below one another have the same if they can.
+    const left = Math.max(62, 22 + 6.4 * Math.max(...levels.map(([, text]) => text.length)));
     if (what.square) {
       const middle = (xs[0] + xs[1]) / 2;
       const half = ((ys[1] - ys[0]) / 2) * ((width - left - right) / (height - top - below));
@@ -102,10 +105,10 @@ export class Plot {
       element("text", { class: "tick", x: px(x), y: height - below + 14, "text-anchor": "middle" }, svg)
         .textContent = String(x);
     }
-    for (const y of ticks(ys[0], ys[1], height / 50)) {
+    for (const [y, text] of levels) {
       element("path", { class: "grid-line", d: `M${left} ${py(y)}H${width - right}` }, svg);
       element("text", { class: "tick", x: left - 6, y: py(y) + 4, "text-anchor": "end" }, svg)
-        .textContent = String(y);
+        .textContent = text;
     }
     element("text", { class: "axis", x: (left + width - right) / 2, y: height - 4, "text-anchor": "middle" }, svg)
       .textContent = axisTitle(this.words.x);
