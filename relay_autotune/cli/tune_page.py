@@ -547,15 +547,13 @@ class GainsPage:
             yield "", "now", f"{self.live.told.controller} has {self.live.told.present}"
             after = "; at once, without a bump of the command"
         if message is not None:
-            yield "", "gains", f"{gains_words(gains_from_message(message))}{after}"
+            yield "", "new gains", f"{gains_words(gains_from_message(message))}{after}"
             if message.verdict != PidGains.VERDICT_TRUSTED:
                 yield "note", "doubtful", message.verdict_reason
         if wish.what == REVERT:
-            yield "", "gains", f"those before{after}"
+            yield "", "new gains", f"those before{after}"
         elif wish.what == APPLY:
             yield "", "step", "none: they are not verified"
-        elif not self.loop.proves:
-            yield "", "if it fails", "the gains before come back by themselves"
 
     def _steps(self, message: Any) -> Proof | StepsHere:
         """Return which steps may prove gains.

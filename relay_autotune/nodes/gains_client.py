@@ -437,8 +437,9 @@ class StepsHere:
         """
         self.allowed.require(step)
         moves = f"The set-point steps by {step:+g} y and back, once the loop is at rest."
+        fails = ("if it fails", "The gains before come back by themselves.")
         if self.choice is None:
-            return (("moves", moves),)
+            return ("moves", moves), fails
         told, lasts = self.choice.expected(step), duration(self.choice.lasts)
         expected = f"The command is expected {told}, for about {lasts}."
-        return ("moves", moves), ("expected", expected)
+        return ("moves", moves), ("expected", expected), fails

@@ -195,6 +195,18 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     assert not asked and not answers
 
 
+def test_without_a_record_of_a_tune_the_node_alone_refuses_a_step() -> None:
+    unknown, given = StepsHere(None, 0.0), StepsHere(None, -0.5)
+    with pytest.raises(LoopError, match="the height of the step is not known: give --step"):
+        assert unknown.step
+    assert given.step == -0.5
+    plan = dict(unknown.plan(1e6))
+    assert plan["moves"].startswith("The set-point steps by +1e+06 y and back")
+    assert "expected" not in plan and "come back" in plan["if it fails"]
+    with pytest.raises(TuningError, match="expected other than 0"):
+        unknown.plan(0.0)
+
+
 def client_of(prove: Any, in_force: Any) -> Any:
     return SimpleNamespace(
         in_force=in_force, identified=lambda: (MODEL, 0.01),

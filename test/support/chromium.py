@@ -170,7 +170,11 @@ class Tab:
         :param expression: JavaScript.
         :param seconds: longest wait.
         """
-        self.until(lambda: self.eval(f"!!(document.body && ({expression}))"), expression, seconds)
+        self.until(
+            lambda: self.eval(f"!!(document.readyState === 'complete' && ({expression}))"),
+            expression,
+            seconds,
+        )
 
     def until(self, holds: Callable[[], Any], what: str, seconds: float = 60.0) -> Any:
         """Return a value once it is true."""

@@ -142,7 +142,10 @@ export class Live {
     this.model = new Plot($("plot-so-far"), { label: "Measurement so far, and the model", x: "time [s]", y: "measurement [y]" });
     this.ultimate = new Plot($("plot-ku"), { label: "K_u after each cycle with its 95 % interval", x: "cycles", y: "K_u [u/y]" });
     this.proof = new Plot($("plot-proof"), { label: "Verification: measured and predicted", x: "time [s]", y: "measurement [y]" });
-    $("prove").addEventListener("click", () => this.begin("prove", "Prove the gains", this.told.controller ? "Apply and verify" : "Prove the gains"));
+    $("prove").addEventListener("click", () => {
+      const words = this.told.controller ? "Apply and verify" : "Prove the gains";
+      this.begin("prove", words, words);
+    });
     $("apply").addEventListener("click", () => this.begin("apply", "Apply without a step", "Apply"));
     $("verify").addEventListener("click", () => this.begin("verify", "Verify the gains in force", "Verify"));
     $("revert").addEventListener("click", () => this.begin("revert", "Return to the earlier gains", "Return to them"));

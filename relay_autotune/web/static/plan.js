@@ -92,7 +92,8 @@ export class Plan {
         return;
       }
     }
-    this.say(refusal || "Nothing moves before you agree; it can be ended at any time.", lines, !refusal, Boolean(refusal), refused);
+    const calm = form.length ? "Nothing moves before you agree; it can be ended at any time." : "Nothing changes before you agree.";
+    this.say(refusal || calm, lines, !refusal, Boolean(refusal), refused);
   }
 
   // ready: whether it can be agreed to; bad: whether it is refused, for the answer of that name
