@@ -52,6 +52,8 @@ _LOGARITHM = 1.0
 # Draws of the mixture, whose share of bad ones is known to 5 %, and of each half.
 DRAWS = 100
 _DRAWS_OF_HALF = 40
+# Most that the density may fall at a standard deviation, in which it falls by 1 if it is normal.
+_FALLS = 2.0
 # Farthest point of the search in standard deviations of the prior.
 _FARTHEST = 20.0
 # Tries for each draw.
@@ -229,9 +231,11 @@ def _apart(halves: Sequence[Part], frequency: float) -> float:
         found.append(np.stack((logs.real, logs.imag)))
     difference = found[0].mean(axis=1) - found[1].mean(axis=1)
     difference[1] = (difference[1] + math.pi) % (2.0 * math.pi) - math.pi
-    covariance = np.cov(found[0]) + np.cov(found[1])
-    if not np.all(np.isfinite(covariance)):
+    first, second = (np.cov(logs) for logs in found)
+    if not max(first[0, 0], second[0, 0]) < _LOGARITHM**2:
+        # A half that knows the gain no better than the prior does tells nothing.
         return 0.0
+    covariance = first + second
     return 0.5 * float(difference @ np.linalg.pinv(covariance, hermitian=True) @ difference)
 
 
@@ -356,7 +360,7 @@ class _Density:
         """Yield points by Laplace's approximation; None: the density is less than it says."""
         axes, values, _ = self.axes_at(here)
         # The symmetric root, which turns on no sign or order of the axes.
-        root = (axes / np.sqrt(1.0 + values**2)) @ axes.T
+        root = (axes * self._reach(here, axes, 1.0 / np.sqrt(1.0 + values**2))) @ axes.T
         least = here.cost(here.variance)
         while True:
             for normal in _normal(count, here.at.size, rng)[:count]:
@@ -364,6 +368,26 @@ class _Density:
                 # Density over that of the normal distribution about the most likely point.
                 rise = point.cost(here.variance) - least - float(normal @ normal)
                 yield point if math.log(1.0 - rng.random()) <= -0.5 * rise else None
+
+    def _reach(self, here: _Point, axes: FloatArray, linear: FloatArray) -> FloatArray:
+        """Return standard deviations along axes, halved where the density falls sooner.
+
+        A zero and a dead time that cancel each other to first order do not for long.
+
+        :param here: the most likely point.
+        :param axes: in units of the prior, shape (p, p).
+        :param linear: standard deviations by the slopes, shape (p,).
+        """
+        found, least = linear.copy(), here.cost(here.variance)
+        for i, axis in enumerate(axes.T):
+            for _ in range(_STEPS):
+                away = found[i] * self.deviation * axis
+                ends = (self.about(here.at + a, here.sign) for a in (-away, away))
+                # In a normal distribution it would be 1.
+                if 0.5 * sum(end.cost(here.variance) - least for end in ends) <= _FALLS:
+                    break
+                found[i] *= 0.5
+        return found
 
 
 def _point_of(gain: FloatArray, theta: FloatArray) -> FloatArray:
@@ -467,11 +491,19 @@ def _normal(count: int, size: int, rng: np.random.Generator) -> FloatArray:
 def _slopes(problem: Problem, gain: FloatArray, theta: FloatArray) -> FloatArray:
     """Return a model's derivatives by numerator and theta beside the nuisances, (k + m, n).
 
+    Where theta changes what is estimated beside the model, such as the answer to a load, so does
+    it change what is seen.
+
     :param problem: the samples.
     :param gain: coefficients of the numerator, shape (k,).
     :param theta: shape (m,).
     """
     columns, derivatives = problem.columns(theta)
-    by_theta = np.einsum("k,mkn->mn", gain, derivatives[:, : gain.size])
-    own = np.concatenate((columns[: gain.size], by_theta))
-    return left_of(problem.seen(own), problem.seen(columns[gain.size :]))
+    k = gain.size
+    left = problem.y - gain @ columns[:k]
+    rows = problem.seen(np.concatenate((left[None, :], columns[k:])))
+    beside = np.linalg.lstsq(rows[1:].T, rows[0], rcond=None)[0]
+    by_theta = np.einsum(
+        "k,mkn->mn", np.concatenate((gain, beside))[: derivatives.shape[1]], derivatives
+    )
+    return left_of(problem.seen(np.concatenate((columns[:k], by_theta))), rows[1:])
