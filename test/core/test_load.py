@@ -86,3 +86,12 @@ def test_what_is_not_known_of_the_load_widens_the_intervals():
     as_if_known = identify(replace(record, held_input=driven), "waveform", known)
     assert loaded.ultimate_gain_std > as_if_known.ultimate_gain_std
     assert np.all(np.diag(loaded.covariance) > np.diag(as_if_known.covariance))
+
+
+@pytest.mark.parametrize(("noise_std", "seed"), [(0.0114, 1003), (0.0001, 3)])
+def test_all_draws_are_had_beside_a_load_and_a_zero_that_a_dead_time_cancels(noise_std, seed):
+    acting = {"load_time": 25.6, "load_size": 0.2, "noise_std": noise_std, "seed": seed}
+    record = run(SECOND_ORDER, **acting).record()
+    found = identify(record, "waveform", Known(structure="sopdt_zero"))
+    # By the slopes of the model alone 35 and 1 were had.
+    assert len(found.draws) >= 90
