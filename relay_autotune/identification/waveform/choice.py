@@ -93,10 +93,10 @@ _HOPELESS = 30.0
 # Length of the record in correlation times of the slow disturbance that is tried first.
 _SLOWEST = 10.0
 _ALIKE = 0.01
-# Gain in the score from which a response counts as one: odds of 3,000 to 1. Of 90 simulated pairs
-# of command and measurement that belong together it refused 3 whose gains were trusted, and of 90
-# that do not, 19 of the 43 with gains.
-_ANSWERED = 16.0
+# Gain in the score from which a response counts as one: odds of 20,000 to 1. Of 90 simulated pairs
+# of command and measurement that belong together it refused 4 whose gains were trusted, and of 90
+# that do not, 23 of the 43 with gains.
+_ANSWERED = 20.0
 # Scores that differ by less do not tell two structures apart.
 _INDIFFERENT = 2.0
 # Mean square that a model in colour may leave, over that of the best simulation: a colour near a
