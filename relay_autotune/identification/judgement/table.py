@@ -276,6 +276,8 @@ LOOP_CHECKS = (
         "the first change of the command to the last sample that was fitted",
         unit="",
         doubtful=1.0,
+        # Feedback of a tenth changes nothing that the record shows by more than a tenth.
+        failed=10.0,
         sentence="at the lowest frequency that the record shows the loop's gain is 1/{value}: how "
         "slowly it settles was not seen",
         remedy="record for longer after the first change of the command",

@@ -136,13 +136,12 @@ def _on_both_sides(
 
 
 def _plain(fit: Fit) -> list[TransferFunction]:
-    """Return the plain models that simulate the record nearly as well as a fit in colour.
+    """Return the plain models that simulate the record as well, or nearly so beside a colour.
 
     Part of what a colour explains may be a response that a plain model would explain.
     """
-    if fit.problem.colour is None:
-        return []
-    most, found = _most_left(fit), []
+    white = fit.problem.colour is None
+    most, found = _most_left(fit, 0.0 if white else _AS_WELL), []
     for candidate in fit.candidates:
         if candidate.structure.name not in PLAIN:
             continue
@@ -154,10 +153,10 @@ def _plain(fit: Fit) -> list[TransferFunction]:
     return found
 
 
-def _most_left(fit: Fit) -> float:
+def _most_left(fit: Fit, share: float = _AS_WELL) -> float:
     """Return the largest rms of a model that simulates a record as well as the chosen one."""
     left, total = left_in_simulation(fit.problem, fit.state.coefficients, fit.state.theta)
-    return left + _AS_WELL * total
+    return left + share * total
 
 
 def _draws(
