@@ -382,8 +382,8 @@ class _Density:
             for _ in range(_STEPS):
                 away = found[i] * self.deviation * axis
                 ends = (self.about(here.at + a, here.sign) for a in (-away, away))
-                # In a normal distribution it would be 1.
-                if 0.5 * sum(end.cost(here.variance) - least for end in ends) <= _FALLS:
+                # On both sides: the longer one is not to be cut.
+                if min(end.cost(here.variance) for end in ends) - least <= _FALLS:
                     break
                 found[i] *= 0.5
         return found
