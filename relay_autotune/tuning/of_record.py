@@ -100,7 +100,11 @@ def _unseen(record: Record, options: DesignOptions) -> float:
     """
     if not (record.is_table and options.sample_period > 0.0):
         return 0.0
-    return max(sampling_period(record) - options.sample_period, 0.0)
+    interval = sampling_period(record)
+    # Times in a table are rounded, so that an interval is its period to some digits only.
+    if math.isclose(interval, options.sample_period, rel_tol=1e-6):
+        return 0.0
+    return max(interval - options.sample_period, 0.0)
 
 
 def _spread_in_time(
