@@ -259,8 +259,8 @@ def stepped(count=400):
     return y + np.random.default_rng(1).normal(0.0, 0.005, count), np.where(t >= 20.0, 1.0, 0.0)
 
 
-def step_csv(path, count=400):
-    t, (y, u) = np.arange(count) * 0.5, stepped(count)
+def step_csv(path, count=400, interval=0.5):
+    t, (y, u) = np.round(np.arange(count) * interval, 6), stepped(count)
     rows = zip(t, y, u, t, strict=True)
     text = "Time (s),Level [m],Valve (%),Extra\n" + "".join(
         ",".join(map(repr, map(float, row))) + "\n" for row in rows
@@ -289,6 +289,17 @@ def test_a_csv_and_the_bag_made_of_it_give_equal_numbers(tmp_path, capsys):
     model = a["experiments"][0]["models"][0]
     assert model["gain"] == pytest.approx(1.65, rel=0.02)
     assert model["dead_time"] == pytest.approx(10.0, abs=0.3)
+
+
+def test_the_interval_of_a_csv_is_that_period_however_its_times_are_rounded(tmp_path, capsys):
+    path = step_csv(tmp_path / "step.csv", interval=0.1)
+    status, out, _ = run(capsys, "--json", *FOPDT, "--rule", "imc", "--sample-period", "0.1", path)
+    assert status == 0
+    (found,) = documents(out)[0]["experiments"]
+    (model,) = found["models"]
+    # 0.3 - 0.2 is 2.8e-17 less than 0.1: nothing happened before its row.
+    assert not any("before its row" in warning for warning in model["warnings"])
+    assert "the interval of the recording" in found["gains"][0]["reason"]
 
 
 def test_a_csv_with_more_columns_gives_the_lines_to_copy(tmp_path, capsys):
