@@ -283,6 +283,7 @@ class Loop:
                     "the responses of the closed loop do not die away in any reasonable time"
                 )
         error, step = final - setpoint.measurement, float(setpoint.time[1])
+        command = self._with_kicks(setpoint)
         iae_setpoint, iae_load = (
             _iae(whole, e, step) if math.isfinite(whole) else math.inf
             for whole, e in zip(integrals, (error, load.measurement), strict=True)
@@ -292,7 +293,7 @@ class Loop:
             iae_setpoint=iae_setpoint,
             overshoot=max(float(np.max(-error / final)), 0.0),
             settling_time=_settling_time(setpoint.time, error, BAND * abs(final)),
-            effort_setpoint=self._effort(setpoint),
+            effort_setpoint=abs(float(command[0])) + _variation(command),
             effort_load=_variation(load.command),
         )
 
@@ -313,13 +314,16 @@ class Loop:
         whole = 0.0 if abs(1.0 - final) < _NO_OFFSET else math.inf
         return final, float(to_load[0].real), (whole, math.inf)
 
-    def _effort(self, setpoint: ClosedLoop) -> float:
-        """Return the total variation of the command after a unit step of the set-point."""
-        size, law, command = setpoint.time.size, self.law, setpoint.command
-        if self._has_instants(float(setpoint.time[1]) * size, size):
-            return abs(float(command[0])) + _variation(command)
-        added = law.kick_variation if isinstance(law, SampledLaw) else 0.0
-        return abs(self._first_command()) + _variation(command) + added
+    def _with_kicks(self, setpoint: ClosedLoop) -> FloatArray:
+        """Return the command after a unit step of the set-point with all samples of its kick."""
+        time, size, command = setpoint.time, setpoint.time.size, setpoint.command
+        if self._has_instants(float(time[1]) * size, size):
+            return command
+        kicks = self.law.kicks if isinstance(self.law, SampledLaw) else np.zeros(1)
+        kicked = np.arange(kicks.size) * self.law.period
+        calm = np.concatenate(([self._first_command()], command[1:]))
+        early, rest = np.interp(kicked, time, calm), time > kicked[-1]
+        return np.concatenate((early + kicks, calm[rest]))
 
     def _horizon(self, frequency: float) -> float:
         """Return a first guess of how long the responses last [s]."""

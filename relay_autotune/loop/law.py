@@ -386,19 +386,23 @@ class SampledLaw:
 
     @property
     def jump(self) -> float:
-        """Command just after a unit step of the set-point, beside the law's delay [u/y]."""
-        first = self.gains.kc * self.gains.b + self.integral.top[0]
-        if self.law.slope is Slope.ERROR:
-            first += self.derivative.top[0]
-        return float(first)
+        """Largest command after a unit step of the set-point before the process answers [u/y].
+
+        It comes when the derivative of the error has its peak, which is not the first sample where
+        that is spread over several.
+        """
+        kicks, integral = self.kicks, Running(self.integral)
+        peak = int(np.argmax(np.abs(kicks)))
+        integrated = [integral.step(1.0) for _ in range(1 + peak)]
+        return float(self.gains.kc * self.gains.b + integrated[-1] + kicks[peak])
 
     @property
-    def kick_variation(self) -> float:
-        """Total variation of the command by the derivative of the error after a unit step."""
-        if self.law.slope is not Slope.ERROR or self.gains.td == 0.0:
-            return 0.0
+    def kicks(self) -> FloatArray:
+        """Command by the derivative of the error after a unit step, sample by sample [u/y]."""
+        if self.law.slope is not Slope.ERROR:
+            return np.zeros(1)
         # The steps of its response are the response to an impulse.
-        return float(np.abs(taps_of(self.derivative, self.gains.tf, self.period)).sum())
+        return np.cumsum(taps_of(self.derivative, self.gains.tf, self.period))
 
     def characteristic(self, model: TransferFunction) -> tuple[TransferFunction, ...]:
         """Return the terms L_k of the characteristic equation of the continuous loop."""

@@ -221,8 +221,10 @@ def test_a_step_of_the_set_point_moves_the_command_at_once_as_its_source_does(na
     law = LAWS[name]
     gains = law.best(WANTED, PERIOD)
     source = Source(name, gains)
-    answers = [source.step(1.0, 0.0) for _ in range(1 + law.delay)]
-    assert law.at(gains, PERIOD).jump == pytest.approx(answers[-1], rel=1e-9)
+    # Its derivative has 3, 4 and 3 of 10 in three samples, that of all others is over after one.
+    first = 2 if name == "iec_61131_3_pid" else 1
+    answers = [source.step(1.0, 0.0) for _ in range(first + law.delay)]
+    assert law.at(gains, PERIOD).jump == pytest.approx(max(answers), rel=1e-9)
 
 
 @pytest.mark.parametrize("tf", [0.0, 0.7])
