@@ -17,8 +17,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from relay_autotune.analysis import Task, agreed, analyse, analyse_jointly
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.signals import CLOCKS, TIME_UNITS, Selection
@@ -234,8 +232,8 @@ def _target_from(target: Target, record: Record | None, shaping: Shaping | None)
         target = replace(target, noise_std=shaping.task.options.noise_std)
     if record is None:
         return target
-    reach = float(np.abs(record.command).max())
-    return replace(target, present=resting_command(record), reach=reach, units=record.units)
+    recorded = float(record.command.min()), float(record.command.max())
+    return replace(target, present=resting_command(record), recorded=recorded, units=record.units)
 
 
 def _text(job: Job, analyses: Sequence[Analysis], error: str | None = None) -> str:

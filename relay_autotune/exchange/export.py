@@ -42,7 +42,7 @@ class Target:
     :param command_min: lower clamp of the command [u]; -inf: none.
     :param command_max: upper clamp of the command [u]; inf: none.
     :param present: the command at which the process rests [u]; NaN: not known.
-    :param reach: the largest command of the record, without its sign [u]; NaN: not known.
+    :param recorded: the lowest and the highest command of the record [u]; NaN: not known.
     :param noise_std: standard deviation of the measurement's noise [y]; NaN: not known.
     :param parameters: of a controller_node by name, besides gains and limits of the command.
     :param topics: names of the topics of a controller_node, by their names without a remapping.
@@ -58,7 +58,7 @@ class Target:
     command_min: float = -math.inf
     command_max: float = math.inf
     present: float = math.nan
-    reach: float = math.nan
+    recorded: tuple[float, float] = (math.nan, math.nan)
     noise_std: float = math.nan
     parameters: Mapping[str, Any] = field(default_factory=dict)
     topics: Mapping[str, str] = field(default_factory=dict)
@@ -77,6 +77,21 @@ class Target:
                 f"the lower clamp {self.command_min:g} must be below the upper one, "
                 f"{self.command_max:g}"
             )
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Limits of the command [u]; those that were not given are 0 and 100 of one in %.
+
+        One that was below 0 goes to -100; one that was beyond these has no limit there.
+        """
+        low, high = self.command_min, self.command_max
+        if self.units.get("u") == "%":
+            found = [x for x in (*self.recorded, self.present, low, high) if math.isfinite(x)]
+            if low == -math.inf:
+                low = next(x for x in (0.0, -100.0, low) if min(found, default=0.0) >= x)
+            if high == math.inf and max(found, default=0.0) <= 100.0:
+                high = 100.0
+        return low, high
 
 
 def exported(gains: Gains, how: str, target: Target, *, doubt: str = "") -> str:
@@ -148,18 +163,19 @@ def _remarks_and_values(
     gains: Gains, law: ProgramLaw, target: Target
 ) -> tuple[tuple[str, ...], list[tuple[str, str]]]:
     """Return what is to be known of a law's settings, and these with their values as texts."""
-    low, high = limits = (target.command_min, target.command_max)
+    low, high = limits = target.limits
     of_command = "" if law.command == "any" else f" Its command is the {law.command}."
     if law.unset and not all(map(math.isfinite, limits)):
-        if target.units.get("u") != "%":
-            raise SelectionError(
-                f"{law.name} always limits its command, and to {law.unset} where nothing else is "
-                "set: give the lowest and the highest command, --command-min and --command-max of "
-                "replay or tune"
-            )
-        limits = (max(low, 0.0), min(high, 100.0))
-        of_command = " Its command is in %, from {:g} to {:g}: scale it for the output.".format(
-            *limits
+        raise SelectionError(
+            f"{law.name} always limits its command, and to {law.unset} where nothing else is set: "
+            "give the lowest and the highest command, --command-min and --command-max of replay "
+            "or tune"
+        )
+    if limits != (target.command_min, target.command_max):
+        to_scale = ": scale them for the output" * bool(law.unset)
+        of_command += (
+            f" Commands are in %, from {low:g} to {high:g} (0 to 100 unless others are given)"
+            f"{to_scale}."
         )
     full = _full_command(law, target)
     scale = law.full / full if full else 1.0
@@ -220,7 +236,8 @@ def _full_command(law: ProgramLaw, target: Target) -> float:
     if target.units.get("u") == "%":
         return 100.0
     limits = [abs(x) for x in (target.command_min, target.command_max) if math.isfinite(x)]
-    reach = max((x for x in (*limits, abs(target.present), target.reach) if x == x), default=0.0)
+    others = (abs(x) for x in (target.present, *target.recorded) if math.isfinite(x))
+    reach = max((*limits, *others), default=0.0)
     if reach <= law.full:
         return 0.0
     if not math.isfinite(target.command_max):

@@ -277,6 +277,7 @@ def of_law(law: str, kc: float = 2.0) -> Gains:
     return replace(gains(kc, 5.0), law=law, law_period=0.5)
 
 
+PERCENT = {"y": "°C", "u": "%"}
 OF_OVEN = Target(command_min=0.0, command_max=100.0, present=35.0)
 
 
@@ -306,17 +307,38 @@ def test_a_sketch_is_not_written_without_the_limits_of_its_command():
             exported(of_law("arduino_pid_v1"), "arduino_pid_v1", some)
 
 
-def test_a_command_in_percent_has_its_limits():
-    in_percent = Target(units={"y": "°C", "u": "%"}, command_max=80.0, present=30.0)
-    text = exported(of_law("arduino_pid_v1"), "arduino_pid_v1", in_percent)
-    found = settings_of(text)
-    assert (found["OutputMin"], found["OutputMax"], found["StartOutput"]) == (
-        "0.0",
-        "80.0",
-        "30.0",
-    )
-    assert "Its command is in %, from 0 to 80: scale it for the output." in text
-    assert "kc 2 %/°C" in text and "rested at 30 %" in text
+@pytest.mark.parametrize(
+    ("known", "limits"),
+    [
+        ({"command_max": 80.0}, (0.0, 80.0)),
+        ({"command_min": -20.0}, (-20.0, 100.0)),
+        # A brake, and a pump above its rated speed.
+        ({"recorded": (-40.0, 40.0)}, (-100.0, 100.0)),
+        ({"recorded": (0.0, 110.0), "command_max": 120.0}, (0.0, 120.0)),
+    ],
+)
+def test_a_command_in_percent_has_its_limits_in_every_program(known, limits):
+    in_percent = Target(units=PERCENT, present=30.0, **known)
+    low, high = limits
+    sketch = exported(of_law("arduino_pid_v1"), "arduino_pid_v1", in_percent)
+    found = settings_of(sketch)
+    assert (found["OutputMin"], found["OutputMax"]) == (f"{low}", f"{high}")
+    assert found["StartOutput"] == "30.0"
+    assert "scale them for the output." in sketch
+    assert "kc 2 %/°C" in sketch and "rested at 30 %" in sketch
+    told = f"Commands are in %, from {low:g} to {high:g} (0 to 100 unless others are given)"
+    script = exported(of_law("simple_pid"), "simple_pid", in_percent)
+    assert f"output_limits=({low}, {high})" in script
+    block = exported(of_law("iec_61131_3_pid"), "iec_61131_3_pid", in_percent)
+    assert f"set in the program; set them to {low:g} and {high:g}." in block
+    assert all(told in text for text in (sketch, script, block))
+    clamps = list(as_loaded(pid_controller(gains(2.0, 5.0), in_percent)).values())[-2:]
+    assert clamps == [high, low]
+
+
+def test_a_command_in_percent_beyond_its_range_has_no_limit_there():
+    beyond = Target(units=PERCENT, recorded=(-1.0, 110.0))
+    assert "output_limits=(-100.0, None)" in exported(of_law("simple_pid"), "simple_pid", beyond)
 
 
 @pytest.mark.parametrize(
@@ -404,20 +426,17 @@ def test_esphome_gets_a_climate():
     }
 
 
-PERCENT = {"y": "°C", "u": "%"}
-
-
 @pytest.mark.parametrize(
     ("law", "factor"), [("klipper_heater", 255.0), ("marlin_heater", 255.0), ("esphome_pid", 1.0)]
 )
 @pytest.mark.parametrize(
     ("target", "full"),
     [
-        (Target(units=PERCENT, reach=60.0), 100.0),
+        (Target(units=PERCENT, recorded=(0.0, 60.0)), 100.0),
         # The full command, not the limit, is what the program calls 1.
         (Target(units=PERCENT, command_min=0.0, command_max=80.0), 100.0),
-        (Target(command_min=0.0, command_max=255.0, reach=200.0), 255.0),
-        (Target(reach=0.9), 1.0),
+        (Target(command_min=0.0, command_max=255.0, recorded=(0.0, 200.0)), 255.0),
+        (Target(recorded=(0.0, 0.9)), 1.0),
         (Target(), 1.0),
     ],
     ids=["percent", "limited percent", "counts", "already", "unknown"],
@@ -440,7 +459,7 @@ def gains_in(text: str) -> tuple[float, ...]:
 
 @pytest.mark.parametrize("law", [name for name, law in LAWS.items() if law.full])
 def test_commands_beyond_a_program_are_refused_where_their_full_range_is_not_known(law):
-    for beyond in (Target(reach=60.0), Target(present=60.0), Target(command_min=-5.0)):
+    for beyond in (Target(recorded=(0.0, 60.0)), Target(present=60.0), Target(command_min=-5.0)):
         with pytest.raises(SelectionError, match=r"commands here go to \d+: say .*--command-max"):
             exported(of_law(law), law, beyond)
 
