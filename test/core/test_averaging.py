@@ -15,7 +15,8 @@ from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.result import Identification, identified
 from relay_autotune.identification.waveform.findings import point_stds
 from relay_autotune.identification.waveform.fit_covariance import Fit, estimate_of
-from relay_autotune.identification.waveform.separable import evaluate, problem_of
+from relay_autotune.identification.waveform.problem import problem_of
+from relay_autotune.identification.waveform.separable import evaluate
 from relay_autotune.process.structures import FOPDT, SOPDT, SOPDT_ZERO, Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point

@@ -30,8 +30,9 @@ from relay_autotune.identification.waveform.choice import (
     chosen_fit,
 )
 from relay_autotune.identification.waveform.method import identify_waveform
+from relay_autotune.identification.waveform.problem import problem_of
 from relay_autotune.identification.waveform.residuals import colour_of, slow_colour
-from relay_autotune.identification.waveform.separable import evaluate, problem_of
+from relay_autotune.identification.waveform.separable import evaluate
 from relay_autotune.identification.waveform.starts import start_fopdt
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, structure_named

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from relay_autotune import ExperimentParameters, Known, RelayExperiment, identify
-from relay_autotune.identification.waveform.separable import motions_of
+from relay_autotune.identification.waveform.problem import motions_of
 from relay_autotune.record.record import Outcome
 
 # rad/s for a volt, and seconds to reach it.

@@ -10,7 +10,7 @@ import pytest
 
 from relay_autotune import Record, TransferFunction, identify
 from relay_autotune.analysis import analyse
-from relay_autotune.identification.waveform.separable import problem_of
+from relay_autotune.identification.waveform.problem import problem_of
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Actuator, VirtualProcess

@@ -21,7 +21,8 @@ from relay_autotune.identification.result import Part
 from relay_autotune.identification.waveform.candidates import Candidate
 from relay_autotune.identification.waveform.fit_covariance import Fit, quantisation_step
 from relay_autotune.identification.waveform.posterior import _allowed, _apart, posterior
-from relay_autotune.identification.waveform.separable import evaluate, problem_of, refine
+from relay_autotune.identification.waveform.problem import problem_of
+from relay_autotune.identification.waveform.separable import evaluate, refine
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction

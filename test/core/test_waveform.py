@@ -20,8 +20,9 @@ from sampled_relay import simulate_sampled_relay
 from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
+from relay_autotune.identification.waveform.problem import problem_of
 from relay_autotune.identification.waveform.residuals import ljung_box
-from relay_autotune.identification.waveform.separable import TRIAL, evaluate, problem_of, refine
+from relay_autotune.identification.waveform.separable import TRIAL, evaluate, refine
 from relay_autotune.identification.waveform.starts import (
     latest_dead_time,
     multistart,

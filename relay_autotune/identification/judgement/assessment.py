@@ -24,8 +24,8 @@ from relay_autotune.errors import IdentificationError, ModelError, RecordError
 from relay_autotune.identification.limit_cycle.fold import Fold, as_switched, fold
 from relay_autotune.identification.limit_cycle.fourier import SteadyState, steady_state
 from relay_autotune.identification.result import FitReport, Identification, Validation
+from relay_autotune.identification.waveform.problem import NEGLIGIBLE
 from relay_autotune.identification.waveform.residuals import ljung_box, noise_to_signal
-from relay_autotune.identification.waveform.separable import NEGLIGIBLE
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction

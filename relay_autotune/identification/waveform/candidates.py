@@ -19,17 +19,15 @@ from typing import Any
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
+from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem, pulse
 from relay_autotune.identification.waveform.residuals import Colour, colour_cost
 from relay_autotune.identification.waveform.separable import (
-    NEGLIGIBLE,
     TRIAL,
-    Problem,
     Trial,
     evaluate,
     information_criterion,
     left_in_simulation,
     left_of,
-    pulse,
     refine,
 )
 from relay_autotune.identification.waveform.starts import (

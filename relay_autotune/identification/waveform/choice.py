@@ -30,6 +30,7 @@ from relay_autotune.identification.waveform.candidates import (
     nuisances_of,
 )
 from relay_autotune.identification.waveform.fit_covariance import Fit
+from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import (
     Colour,
@@ -38,9 +39,7 @@ from relay_autotune.identification.waveform.residuals import (
     slow_colour,
 )
 from relay_autotune.identification.waveform.separable import (
-    NEGLIGIBLE,
     TRIAL,
-    Problem,
     Trial,
     information_criterion,
     left_in_simulation,

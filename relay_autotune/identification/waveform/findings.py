@@ -34,12 +34,11 @@ from relay_autotune.identification.waveform.fit_covariance import (
     raw_residual,
 )
 from relay_autotune.identification.waveform.posterior import posterior
+from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.separable import (
-    NEGLIGIBLE,
     TRIAL,
-    Problem,
     Trial,
     left_in_simulation,
     refine,

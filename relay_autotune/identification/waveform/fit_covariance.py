@@ -14,13 +14,14 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.estimate import Estimate, jacobian, relative_steps
 from relay_autotune.identification.waveform.candidates import Candidate
+from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import (
     mean_slope,
     scale_of,
     weights,
 )
-from relay_autotune.identification.waveform.separable import NEGLIGIBLE, Problem, Trial
+from relay_autotune.identification.waveform.separable import Trial
 from relay_autotune.record.record import Record
 
 # Standard deviation of the prior of a dead time, over all times of the process together.

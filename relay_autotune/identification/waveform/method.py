@@ -39,17 +39,15 @@ from relay_autotune.identification.waveform.fit_covariance import (
     quantisation_step,
     raw_residual,
 )
-from relay_autotune.identification.waveform.rational import unit_steps
-from relay_autotune.identification.waveform.residuals import scale_of, weights
-from relay_autotune.identification.waveform.separable import (
+from relay_autotune.identification.waveform.problem import (
     NEGLIGIBLE,
-    TRIAL,
     Problem,
-    Trial,
     motions_of,
     problem_of,
-    refine,
 )
+from relay_autotune.identification.waveform.rational import unit_steps
+from relay_autotune.identification.waveform.residuals import scale_of, weights
+from relay_autotune.identification.waveform.separable import TRIAL, Trial, refine
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, TABLE
 from relay_autotune.record.excitation import at_its_ends, changes_within, smooth

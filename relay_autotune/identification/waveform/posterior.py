@@ -25,11 +25,10 @@ from relay_autotune.errors import ModelError
 from relay_autotune.identification.result import Part
 from relay_autotune.identification.waveform.choice import PLAIN
 from relay_autotune.identification.waveform.fit_covariance import Fit
+from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.separable import (
-    NEGLIGIBLE,
     TRIAL,
-    Problem,
     Trial,
     evaluate,
     left_by,

@@ -16,14 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
+from relay_autotune.identification.waveform.problem import Problem, pulse
 from relay_autotune.identification.waveform.rational import columns_of, free_motion, unit_steps
 from relay_autotune.identification.waveform.separable import (
     TRIAL,
-    Problem,
     Trial,
     evaluate,
     predicted_cost,
-    pulse,
     refine,
 )
 from relay_autotune.process.factors import Quadratic

@@ -1,0 +1,403 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""What is fitted: samples, inputs, and the terms that are estimated beside the model."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relay_autotune.arrays import FloatArray
+from relay_autotune.identification.waveform.rational import columns_of, free_motion
+from relay_autotune.identification.waveform.residuals import Colour
+from relay_autotune.process.structures import Structure
+from relay_autotune.record.record import Input, PiecewiseConstant
+
+# Residual that is rounding, as a share of the measurement's range.
+NEGLIGIBLE = 1e-10
+# The fractional parts of its multiples are spread evenly, without a period (Weyl 1916).
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+# Range of a rest, in steps of the sensor, in which nothing moves.
+_A_STEP = 1.5
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Samples, inputs and structure, with the terms that are estimated beside the model.
+
+    The samples of several experiments on one process follow one another. They share gain and
+    theta; each has its own offset, drift and initial state.
+
+    :param time: sample times, in each experiment not decreasing [s], shape (n,).
+    :param y: what is fitted, in units of its own range, shape (n,).
+    :param inputs: the input of each experiment.
+    :param structure: the structure.
+    :param index: number of each sample among all that were recorded, shape (n,).
+    :param bounds: number of the first sample of each experiment.
+    :param drift: True: a straight line is estimated, not only an offset.
+    :param relaxation: True: a free initial state is estimated.
+    :param weight: square root of each sample's weight, shape (n,); None: all are equal.
+    :param past: True: the command before each experiment is estimated: the process rested, or
+        moved freely, under another level than its first one.
+    :param unequal: True: commands above and below the first one have effects of their own.
+    :param play: True: play between command and process is estimated, which delays each reversal.
+    :param load: when a step of the load came, in the first experiment [s]; its size and a small
+        shift of its time are estimated. None: none came.
+    :param friction: True: dry friction is estimated: a command against each motion, and what it
+        takes of the command while the process stands still.
+    :param motions: the direction in which the measurement moves, 1 or -1, and the command from
+        its first level while it stands still; empty: not seen.
+    :param colour: of the noise; None: white.
+    """
+
+    time: FloatArray
+    y: FloatArray
+    inputs: tuple[Input, ...]
+    structure: Structure
+    index: NDArray[np.int64]
+    bounds: tuple[int, ...] = (0,)
+    drift: bool = False
+    relaxation: bool = False
+    weight: FloatArray | None = None
+    past: bool = False
+    unequal: bool = False
+    play: bool = False
+    load: float | None = None
+    friction: bool = False
+    motions: tuple[PiecewiseConstant, ...] = ()
+    colour: Colour | None = None
+
+    @property
+    def past_is_open(self) -> bool:
+        """True if no command is known from before an experiment begins."""
+        return all(
+            not (u.times.size and u.times[0] <= self.time[part][0])
+            for part, u in zip(self.experiments, self.inputs, strict=True)
+        )
+
+    @cached_property
+    def shortest(self) -> float:
+        """Typical time between samples [s]."""
+        gaps = np.diff(self.time)
+        return float(np.median(gaps[gaps > 0.0]))
+
+    @property
+    def acts_both_ways(self) -> bool:
+        """True if each command moves to both sides of its first level, and stays there, too.
+
+        Of two levels alone, the distance from a third one is the command itself.
+        """
+        return all(
+            isinstance(u, PiecewiseConstant)
+            and bool(u.values.size)
+            and float(u.values.min()) < u.initial < float(u.values.max())
+            and np.unique(u(self.time[part])).size > 2
+            for u, part in zip(self.inputs, self.experiments, strict=True)
+        )
+
+    @cached_property
+    def most_play(self) -> float:
+        """Largest play that the commands show [u]; 0: they show none.
+
+        Each command has to come to one level from above and from below: between two levels alone,
+        play only makes the moves smaller, as a smaller gain does. And all moves have to cross it.
+        """
+        return min(
+            _shown_play(u, self.time[part])
+            for u, part in zip(self.inputs, self.experiments, strict=True)
+        )
+
+    @property
+    def _further(self) -> tuple[str, ...]:
+        """What has responses of its own after the model's, a name for each, in their order."""
+        counts = {
+            "friction": 2 * self.friction,
+            "past": int(self.past),
+            "unequal": int(self.unequal),
+            "play": int(self.play),
+            "load": 2 * (self.load is not None),
+        }
+        return tuple(name for name, count in counts.items() for _ in range(count))
+
+    def places(self, term: str) -> list[int]:
+        """Return where each input of a term has its first coefficient, from the end of all.
+
+        :param term: one of the names in `_further`; of several experiments the last one has these
+            places.
+        """
+        count, lines = len(self.structure.powers), len(self.bounds) * (1 + self.drift)
+        names = self._further
+        return [-lines - (len(names) - k) * count for k, n in enumerate(names) if n == term]
+
+    def relative(self, term: str, coefficients: FloatArray) -> float:
+        """Return the size of what is estimated as an input of its own, per that of the command.
+
+        :param term: as of `places`, one that is estimated.
+        :param coefficients: of a fit, shape (k,).
+        """
+        return float(coefficients[self.places(term)[0]] / coefficients[0])
+
+    def effects(self, coefficients: FloatArray) -> tuple[float, float]:
+        """Return how strongly commands above and below the first one act, relative to the model.
+
+        :param coefficients: of a fit, shape (k,).
+        """
+        share = self.relative("unequal", coefficients) if self.unequal else 0.0
+        return 1.0 + share, 1.0 - share
+
+    def play_of(self, coefficients: FloatArray) -> float:
+        """Return the command that a reversal loses in the play [u]; 0: not estimated.
+
+        :param coefficients: of a fit, shape (k,).
+        """
+        return -2.0 * self.relative("play", coefficients) if self.play else 0.0
+
+    def dry_friction(self, coefficients: FloatArray) -> float:
+        """Return the command that dry friction takes from each motion [u]; 0: not estimated.
+
+        :param coefficients: of a fit, shape (k,).
+        """
+        return -self.relative("friction", coefficients) if self.friction else 0.0
+
+    @property
+    def experiments(self) -> list[slice]:
+        """The samples of each experiment."""
+        if len(self.bounds) == 1:
+            return [slice(0, self.time.size)]
+        ends = [*np.searchsorted(self.index, self.bounds).tolist(), self.time.size]
+        return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+    @property
+    def starts(self) -> FloatArray:
+        """Time of the first sample of each sample's experiment [s], shape (n,)."""
+        found = np.empty(self.time.size)
+        for part in self.experiments:
+            found[part] = self.time[part][0]
+        return found
+
+    def columns(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the linear coefficients' columns, and the derivatives of the first l by theta.
+
+        :param theta: shape (m,).
+        :return: shapes (k, n) and (m, l, n); the k - l columns that theta does not change come
+            last.
+        """
+        parts = self.experiments
+        found = [self._of_one(theta, part, i) for i, part in enumerate(parts)]
+        if len(parts) == 1:
+            (columns, by_theta, rest) = found[0]
+            return np.concatenate((columns, rest)), by_theta
+        k, n = len(self.structure.powers), self.time.size
+        own_rows = sum(columns.shape[0] - k for columns, _, _ in found)
+        last = k + own_rows
+        every = np.zeros((last + sum(rest.shape[0] for _, _, rest in found), n))
+        derivatives = np.zeros((theta.size, last, n))
+        first = k
+        for part, (columns, by_theta, rest) in zip(parts, found, strict=True):
+            # The responses are common to all experiments, the other columns their own.
+            every[:k, part], derivatives[:, :k, part] = columns[:k], by_theta[:, :k]
+            place = slice(first, first + columns.shape[0] - k)
+            every[place, part], derivatives[:, place, part] = columns[k:], by_theta[:, k:]
+            every[last : last + rest.shape[0], part] = rest
+            first, last = place.stop, last + rest.shape[0]
+        return every, derivatives
+
+    def nuisances(self, theta: FloatArray) -> FloatArray:
+        """Return the columns that are no response to the command, as seen, shape (p, n).
+
+        :param theta: shape (m,).
+        """
+        beside = replace(self, unequal=False, play=False)
+        return self.seen(beside.columns(theta)[0][len(self.structure.powers) :])
+
+    def _of_one(
+        self, theta: FloatArray, part: slice, number: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return one experiment's columns with their derivatives, and its straight line."""
+        time = self.time[part]
+        blocks = [columns_of(self.structure, theta, time, self.inputs[number])]
+        if self.relaxation or self.structure.unstable:
+            growing_only = not self.relaxation
+            blocks.append(
+                free_motion(self.structure.denominator, theta, time, growing_only=growing_only)
+            )
+        if self.friction:
+            blocks += [self._at_once(theta, time, seen) for seen in self.motions]
+        further = self.further_inputs(number)
+        blocks += [columns_of(self.structure, theta, time, u) for u in further]
+        rest = self.line(time)
+        if len(blocks) == 1:
+            return *blocks[0], rest
+        columns = np.concatenate([b[0] for b in blocks])
+        return columns, np.concatenate([b[1] for b in blocks], axis=1), rest
+
+    def further_inputs(self, number: int) -> list[PiecewiseConstant]:
+        """Return the inputs beside the command whose responses have the model's dead time.
+
+        :param number: of the experiment.
+        """
+        found = []
+        if self.past:
+            # The level before is that of a step at the first sample, with the same response.
+            found.append(pulse(float(self.time[self.experiments[number]][0])))
+        if self.unequal:
+            found.append(_folded(self.inputs[number]))
+        if self.play:
+            found.append(_turns(self.inputs[number]))
+        if self.load is not None:
+            found += [pulse(self.load, length) for length in (math.inf, self.shortest)]
+        return found
+
+    def line(self, time: FloatArray) -> FloatArray:
+        """Return the offset and, where estimated, the drift of one experiment, shape (1 or 2, n).
+
+        :param time: of its samples [s], shape (n,).
+        """
+        rows = np.ones((1 + self.drift, time.size))
+        if self.drift:
+            rows[1] = (time - time.mean()) / np.ptp(time)
+        return rows
+
+    def _at_once(
+        self, theta: FloatArray, time: FloatArray, u: PiecewiseConstant
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the response to an input that acts without dead time, with its derivatives."""
+        columns, by_theta = columns_of(self.structure, np.append(theta[:-1], 0.0), time, u)
+        by_theta[-1] = 0.0
+        return columns, by_theta
+
+    def seen(self, rows: FloatArray) -> FloatArray:
+        """Return rows multiplied by the samples' weights, and whitened by the noise's colour.
+
+        :param rows: shape (..., n).
+        """
+        if self.weight is not None:
+            rows = rows * self.weight
+        if self.colour is None:
+            return rows
+        parts = [self.colour.whitened(rows[..., part]) for part in self.experiments]
+        return np.concatenate(parts, axis=-1)
+
+    def part(self, chosen: NDArray[np.bool_] | slice) -> Problem:
+        """Return the problem of some of the samples, of each experiment at least a few."""
+        return replace(
+            self,
+            time=self.time[chosen],
+            y=self.y[chosen],
+            index=self.index[chosen],
+            weight=None if self.weight is None else self.weight[chosen],
+        )
+
+    def thinned(self, most: int, *, scattered: bool = False) -> Problem:
+        """Return the problem of evenly spaced samples.
+
+        :param most: largest number to keep, of all experiments together.
+        :param scattered: True: one out of each such space, anywhere in it. Evenly spaced ones may
+            meet a command that repeats itself at the same instant each time.
+        """
+        share = max(most // len(self.bounds), 1)
+        if all(part.stop - part.start <= share for part in self.experiments):
+            return self
+        chosen = np.zeros(self.time.size, dtype=bool)
+        for part in self.experiments:
+            step = -(-(part.stop - part.start) // share)
+            at = np.arange(part.start, part.stop, step)
+            if scattered:
+                away = (step * (_GOLDEN * np.arange(at.size) % 1.0)).astype(np.int64)
+                at = np.minimum(at + away, part.stop - 1)
+            chosen[at] = True
+        return self.part(chosen)
+
+
+def pulse(begin: float = 0.0, length: float = math.inf) -> PiecewiseConstant:
+    """Return a unit step, or a pulse that ends after a while.
+
+    :param begin: s.
+    :param length: s.
+    """
+    if math.isinf(length):
+        return PiecewiseConstant(np.array([begin]), np.ones(1), 0.0)
+    return PiecewiseConstant(np.array([begin, begin + length]), np.array([1.0, 0.0]), 0.0)
+
+
+def _folded(u: Input) -> PiecewiseConstant:
+    """Return the distance of a held command from its first level."""
+    assert isinstance(u, PiecewiseConstant)
+    return PiecewiseConstant(u.times, np.abs(u.values - u.initial), 0.0)
+
+
+def _turns(u: Input) -> PiecewiseConstant:
+    """Return the direction of a held command's last move, 1 or -1, and 0 before the first.
+
+    Behind a play that every move crosses, a process feels the command less half of the play in
+    that direction.
+    """
+    assert isinstance(u, PiecewiseConstant)
+    moves = np.sign(np.diff(u.values, prepend=u.initial))
+    moved = moves != 0.0
+    return PiecewiseConstant(u.times[moved], moves[moved], 0.0)
+
+
+def _shown_play(u: Input, time: FloatArray) -> float:
+    """Return the least way of a command between two turns, where that shows a play [u]; or 0."""
+    if not isinstance(u, PiecewiseConstant):
+        return 0.0
+    turns = _turns(u)
+    # Of the last move little is seen.
+    times = turns.times[(turns.times >= time[0]) & (turns.times < time[-1])][:-1]
+    level, direction = u(times), turns(times)
+    if not np.intersect1d(level[direction > 0.0], level[direction < 0.0]).size:
+        return 0.0
+    ends = level[np.append(np.diff(direction) != 0.0, True)]
+    return float(np.abs(np.diff(ends, prepend=u.initial)).min())
+
+
+def problem_of(
+    records: Sequence[tuple[FloatArray, FloatArray, Input]], structure: Structure
+) -> Problem:
+    """Return the problem of fitting a structure to one or several experiments.
+
+    :param records: sample times [s], what is fitted, and input of each.
+    :param structure: the structure.
+    """
+    sizes = [time.size for time, _, _ in records]
+    return Problem(
+        np.concatenate([time for time, _, _ in records]),
+        np.concatenate([y for _, y, _ in records]),
+        tuple(u for _, _, u in records),
+        structure,
+        np.arange(sum(sizes)),
+        tuple(int(b) for b in np.cumsum([0, *sizes[:-1]])),
+    )
+
+
+def motions_of(time: FloatArray, y: FloatArray, u: Input) -> tuple[PiecewiseConstant, ...]:
+    """Return in which direction the measurement moves, where its samples show that.
+
+    They do if it rests at one value before the command's first change, to a step of the sensor,
+    and most samples later differ from the one before. In noise no sample tells of a motion.
+
+    :param time: of the samples [s], shape (n,).
+    :param y: the measurement, in any unit, shape (n,).
+    :param u: the command.
+    :return: as ``Problem.motions``.
+    """
+    steps = np.diff(y)
+    first = u.times[0] if u.times.size else math.inf
+    rest, later = steps[time[1:] <= first], steps[time[1:] > first]
+    sizes = np.abs(later[later != 0.0])
+    if not rest.size or 2 * sizes.size <= later.size or not isinstance(u, PiecewiseConstant):
+        return ()
+    if np.ptp(np.cumsum(rest)) > _A_STEP * sizes.min():
+        return ()
+    held = np.where(steps == 0.0, u(time[:-1]) - u.initial, 0.0)
+    # Of samples with one stamp, as a slow clock gives them, the last one counts.
+    last = np.diff(time) > 0.0
+    return tuple(PiecewiseConstant(time[:-1][last], x[last], 0.0) for x in (np.sign(steps), held))
