@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager, suppress
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import rclpy
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
@@ -29,6 +30,7 @@ from relay_autotune.errors import FieldError, LoopError, ParameterError
 from relay_autotune.exchange.messages import made_visible
 from relay_autotune.nodes import quality
 
+_Result = TypeVar("_Result")
 # How long present commands are listened to [s].
 _LISTEN = 1.0
 # How long a node may take to answer [s], and after which time one may be asked again.
@@ -282,6 +284,19 @@ class LoopClient:
                 return False
             self._executor.spin_once(timeout_sec=min(left, 0.05))
         return True
+
+    def computed(self, work: Future[_Result], leave: Callable[[], bool]) -> _Result:
+        """Return what another thread computes; messages are handled, and signals are heeded.
+
+        :param work: what is computed.
+        :param leave: returns True when it is to end.
+        :raises LoopError: if it has to end before.
+        """
+        self.wait(lambda: work.done() or leave(), math.inf)
+        if not work.done():
+            work.cancel()
+            raise LoopError("ended while it was computed")
+        return work.result()
 
     def rest(self, seconds: float) -> None:
         """Handle messages for a time.

@@ -17,9 +17,9 @@ import pytest
 
 from relay_autotune.cli import apply_gains
 from relay_autotune.cli.apply_gains import found_entries, verdict_entries
+from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import labelled
-from relay_autotune.cli.tune_page import GainsPage
 from relay_autotune.control.step_choice import StepRange
 from relay_autotune.errors import LoopError, TuningError
 from relay_autotune.exchange.messages import fill_gains, fill_reason

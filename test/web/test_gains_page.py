@@ -11,8 +11,8 @@ import pytest
 from analysed import analysed_once
 from served import analysed, subject_of
 
-from relay_autotune.cli import tune_page
-from relay_autotune.cli.tune_page import GainsPage
+from relay_autotune.cli import gains_page
+from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.tuned import Proof
 from relay_autotune.control.step_choice import StepRange
 from relay_autotune.errors import TuningError
@@ -31,7 +31,7 @@ def sent(subject, wish):
     """Return the message with the gains that a wish means."""
     # What a worker would compute.
     worker = SimpleNamespace(ask=lambda work: ThreadPoolExecutor(1).submit(work))
-    client = SimpleNamespace(wait=lambda is_done, patience: [None for _ in iter(is_done, True)])
+    client = SimpleNamespace(computed=lambda work, leave: work.result())
     page = SimpleNamespace(subjects=[subject], worker=worker)
     loop = SimpleNamespace(client=client)
     return GainsPage(loop, Live("/relay_node"), page, 0, lambda: False)._message(wish)
@@ -81,7 +81,7 @@ def test_gains_that_are_not_there_are_not_sent(wish):
 def test_a_proof_that_is_refused_leaves_the_one_that_has_passed():
     subject, live = subject_of(analysed()), Live("/relay_node")
     worker = SimpleNamespace(ask=lambda work: ThreadPoolExecutor(1).submit(work))
-    client = SimpleNamespace(wait=lambda is_done, patience: [None for _ in iter(is_done, True)])
+    client = SimpleNamespace(computed=lambda work, leave: work.result())
     loop = SimpleNamespace(client=client, proves=True)
     page = SimpleNamespace(subjects=[subject], worker=worker)
     passed = (("verdict", "passed"),)
@@ -100,7 +100,7 @@ def test_a_proof_that_is_refused_leaves_the_one_that_has_passed():
 def test_a_proof_is_in_the_report_of_its_gains_and_is_computed_once(monkeypatch):
     subject, live = subject_of(analysed()), Live("/relay_node")
     worker = SimpleNamespace(ask=lambda work: ThreadPoolExecutor(1).submit(work))
-    client = SimpleNamespace(wait=lambda is_done, patience: [None for _ in iter(is_done, True)])
+    client = SimpleNamespace(computed=lambda work, leave: work.result())
     options = SimpleNamespace(at=2.0)
     loop = SimpleNamespace(client=client, proves=True, options=options)
     page = SimpleNamespace(subjects=[subject], worker=worker)
@@ -124,7 +124,7 @@ def test_a_proof_is_in_the_report_of_its_gains_and_is_computed_once(monkeypatch)
             asked.append(step)
             return Verify.Result(passed=True, reason="numbers", steps=[made])
 
-    monkeypatch.setattr(tune_page, "Proof", Made)
+    monkeypatch.setattr(gains_page, "Proof", Made)
     gains._tuned = object()
     wish = replace(CALM, what="prove")
     plan = gains.plan(replace(wish, dry=1))

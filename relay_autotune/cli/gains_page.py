@@ -1,0 +1,292 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""Gains of a page in the loop's controller_node: put in force, proved and taken back."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+from relay_autotune.cli.apply_gains import verified
+from relay_autotune.cli.loops import Loop
+from relay_autotune.cli.tuned import CONTROLLER, Proof, Tuned, gains_words
+from relay_autotune.errors import LoopError, RelayAutotuneError, TuningError
+from relay_autotune.exchange.messages import (
+    fill_gains,
+    gains_from_message,
+)
+from relay_autotune.loop.gains import Controller
+from relay_autotune.nodes.gains_client import GainsClient, StepsHere
+from relay_autotune.verdict import Verdict
+from relay_autotune.web.live import (
+    APPLY,
+    PROVE,
+    REVERT,
+    VERIFY,
+    Live,
+    PageCommand,
+    PagePlan,
+)
+from relay_autotune.web.server import Page
+from relay_autotune.web.shape import PageModel
+from relay_autotune.web.wire import curve
+from relay_autotune_msgs.msg import PidGains
+
+# How long to look for the action of a controller_node [s].
+_FOUND_WITHIN = 5.0
+# Interval at which the gains in force are read while nothing else happens [s].
+_LOOK_EVERY = 3.0
+
+
+@dataclass
+class GainsPage:
+    """Gains of the page in the loop's controller_node.
+
+    :param loop: the loop.
+    :param live: what pages see.
+    :param page: with the models whose gains are shaped.
+    :param number: of the loop on the page.
+    :param leave: returns True when a verification is to end.
+    """
+
+    loop: Loop
+    live: Live
+    page: Page
+    number: int
+    leave: Callable[[], bool]
+    _controller: GainsClient | None = None
+    _looked: float = -math.inf
+    # The last tune with gains, and which steps may prove some gains: computed once.
+    _tuned: Tuned | None = None
+    _known: tuple[Controller | None, Proof | StepsHere] | None = None
+
+    def close(self) -> None:
+        """Leave the controller."""
+        if self._controller is not None:
+            self._controller.close()
+            self._controller = None
+
+    def look_now_and_then(self) -> None:
+        """Read the gains in force, at an interval."""
+        if time.monotonic() - self._looked > _LOOK_EVERY:
+            self.look()
+
+    def look(self) -> None:
+        """Read the gains in force, and show them beside the new ones."""
+        # A controller_node of the command lives for its proof alone.
+        found = [] if self.loop.proves else self.loop.client.controllers()
+        if self._controller is None or self._controller.name not in found:
+            self.close()
+            if found:
+                self._controller = GainsClient("", found[0], beside=self.loop.client)
+        self._looked = time.monotonic()
+        if (controller := self._controller) is None:
+            if self.live.told.controller:
+                self.live.tell(controller="", present="")
+            return
+        try:
+            present = controller.in_force()
+        except RelayAutotuneError:
+            # It may be about to end: the next look tells.
+            return
+        self.live.tell(controller=controller.name, present=gains_words(present))
+        for subject in self.page.subjects:
+            if subject.loop == self.number and subject.case.present != present:
+                subject.case = replace(subject.case, present=present)
+
+    def look_after_tune(self, tune: Tuned) -> None:
+        """Read the gains in force; those of the tune may be proven.
+
+        :param tune: that has ended.
+        """
+        self._known = None
+        self.look()
+        if self.loop.proves and tune.has_gains:
+            self._tuned = tune
+            self.live.tell(proves=True, proof=())
+
+    # What a wish would do.
+
+    def plan(self, wish: PageCommand) -> PagePlan:
+        """Return what a wish would do, or why it cannot be done.
+
+        :param wish: to apply, prove, verify or revert.
+        """
+        step, refusal, lines = wish.step, "", list[tuple[str, ...]]()
+        makes_step = wish.what in (PROVE, VERIFY)
+        try:
+            message = self._message(wish)
+            lines += self._about_gains(wish, message)
+            if makes_step:
+                steps = self._steps(message)
+                step = step or steps.step
+                lines += [("", *line) for line in steps.plan(step)]
+                lines.append(("", "allowed", steps.allowed.words))
+        except RelayAutotuneError as error:
+            refusal = str(error)
+        asked = {"name": "step", "question": "step of the set-point", "unit": "y", "ends": 1,
+                 "values": [step or None], "now": "", "needed": True}  # fmt: skip
+        refused = "step" * bool(step and refusal)
+        return PagePlan(0, refusal, refused, tuple(lines), (asked,) * makes_step)
+
+    def _about_gains(self, wish: PageCommand, message: Any) -> Iterator[tuple[str, ...]]:
+        """Yield the lines of a plan that say which gains are there, and which come."""
+        after = ""
+        if not self.loop.proves:
+            self._found()
+            yield "", "now", f"{self.live.told.controller} has {self.live.told.present}"
+            after = "; at once, without a bump of the command"
+        if message is not None:
+            yield "", "new gains", f"{gains_words(gains_from_message(message))}{after}"
+            if message.verdict != PidGains.VERDICT_TRUSTED:
+                yield "note", "doubtful", message.verdict_reason
+        if wish.what == REVERT:
+            yield "", "new gains", f"those before{after}"
+        elif wish.what == APPLY:
+            yield "", "step", "none: they are not verified"
+
+    def _steps(self, message: Any) -> Proof | StepsHere:
+        """Return which steps may prove gains.
+
+        :param message: the `PidGains`; None: those in force.
+        """
+        if self.loop.proves and self._tuned is None:
+            raise TuningError("there are no gains of a tune that could be proven here")
+        gains = self._found().in_force() if message is None else gains_from_message(message)
+        if self._known is None or self._known[0] != gains:
+            steps = Proof(self._tuned, message) if self._tuned else self._found().steps(gains)
+            self._known = gains, steps
+        return self._known[1]
+
+    def _found(self) -> GainsClient:
+        """Return the client of the running controller_node."""
+        if self._controller is None:
+            raise LoopError("no controller_node is in this namespace")
+        self._controller.find(_FOUND_WITHIN)
+        return self._controller
+
+    # What is done.
+
+    def do(self, wish: PageCommand) -> None:
+        """Do what was wished with the gains in force.
+
+        :param wish: to apply, prove, verify or revert.
+        """
+        live = self.live
+        live.forget_wishes()
+        try:
+            self._do(wish)
+        except RelayAutotuneError as error:
+            live.rest(str(error), good=False)
+        if live.told.window[1:] == (0.0,):
+            live.tell(window=(live.told.window[0], live.now))
+        live.forget_wishes()
+        # Limits and gains may be others at the next wish.
+        self._known = None
+        self.look()
+
+    def _do(self, wish: PageCommand) -> None:
+        live = self.live
+        if wish.what == REVERT:
+            live.tell(phase="applying", tone="", status="bringing back the gains before")
+            live.rest(self._found().ask("revert"), good=True, proof=())
+            return
+        message = self._message(wish)
+        steps = None if wish.what == APPLY else self._steps(message)
+        if isinstance(steps, Proof):
+            self._prove(steps, wish)
+            return
+        controller = self._found()
+        with controller.accepting_doubtful() if wish.doubtful else nullcontext():
+            if steps is None:
+                live.tell(phase="applying", tone="", status="putting the gains in force")
+                told = controller.put_in_force(message)
+                live.rest(f"{told}; they are not verified", good=True, proof=())
+                return
+            step = wish.step or steps.step
+            steps.allowed.require(step)
+            with controller.offered(message) if message else nullcontext() as gains:
+                self._verify(controller, step, gains)
+
+    def _prove(self, proof: Proof, wish: PageCommand) -> None:
+        """Prove gains by a controller_node of the command, which ends after it."""
+        live, step = self.live, wish.step or proof.step
+        proof.allowed.require(step)
+        self._begin_step(f"starting {CONTROLLER}")
+        result = proof.made(
+            step, wish.doubtful, lambda text: live.tell(status=text), self.leave, self._show_steps
+        )
+        left = f"; the command stands at {self.loop.options.at:.6g} u"
+        entries = proof.entries(result)
+        if result.steps:
+            subject = self.page.subjects[wish.of]
+            subject.case = replace(subject.case, proof=entries)
+        self._rest("proof", result, entries, left)
+
+    def _verify(self, controller: GainsClient, step: float, new: Controller | None) -> None:
+        live = self.live
+        self._begin_step("")
+        result, entries = verified(
+            controller, step, lambda text: live.tell(status=text), self.leave, new
+        )
+        self._show_steps(controller.steps_of(result))
+        self._rest("verification", result, entries)
+
+    def _rest(
+        self, what: str, result: Any, entries: Sequence[tuple[str, str]], left: str = ""
+    ) -> None:
+        """Tell how a step has ended; the proof before stays where it was cut short."""
+        self.live.rest(
+            f"{what} {'passed' if result.passed else 'failed'}: {result.reason}{left}",
+            good=result.passed,
+            proof=tuple(entries) if result.steps else self.live.told.proof,
+        )
+
+    def _show_steps(self, steps: Sequence[Any]) -> None:
+        """Show a proof in place of the one before; one that was cut short has no steps."""
+        if steps:
+            self.live.show("proof", [_document(step) for step in steps])
+
+    def _begin_step(self, status: str) -> None:
+        """Show from now on the samples of a step in place of those of the tune."""
+        live = self.live
+        live.tell(
+            phase="verifying", tone="warn", status=status, window=(live.now, 0.0),
+            setpoint=math.nan, levels=(),
+        )  # fmt: skip
+
+    def _message(self, wish: PageCommand) -> Any:
+        """Return the gains that the page shows as a message; None: those in force are meant."""
+        if wish.what in (VERIFY, REVERT):
+            return None
+        if wish.asked is None or not 0 <= wish.of < len(self.page.subjects):
+            raise TuningError("there are no such gains")
+        subject: PageModel = self.page.subjects[wish.of]
+        if subject.loop != self.number:
+            raise TuningError(f"the gains are for another loop than {self.live.told.node}")
+        work = self.page.worker.ask(partial(subject.shaped, wish.asked))
+        shaped = self.loop.client.computed(work, self.leave)
+        gains, judgement = shaped.gains, shaped.judgement
+        if judgement.verdict is not Verdict.TRUSTED and not wish.doubtful:
+            raise TuningError(f"the gains are doubtful, and were not accepted: {judgement.reason}")
+        message = PidGains()
+        fill_gains(message, gains, experiment_id=subject.case.experiment_id, judgement=judgement)
+        return message
+
+
+def _document(step: Any) -> dict[str, Any]:
+    """Return a step of a verification for the page: what was measured over what was predicted."""
+    setpoint = step.kind == step.SETPOINT
+    what = "set-point" if setpoint else "load"
+    return {
+        "name": f"step of the {what} by {step.step:+g} {'y' if setpoint else 'u'}",
+        "measurement": curve(step.time, step.measurement),
+        "predicted": curve(step.time, step.predicted),
+        "command": curve(step.time, step.command),
+    }
