@@ -132,15 +132,17 @@ def _only(topics: Topics, pairs: Sequence[Pair]) -> tuple[tuple[str, str], list[
     if len(pairs) == 1:
         ((y, u, reason),) = pairs
         return (y, u), [f"using {flags_of(y, u)}: {reason}"]
-    if pairs:
+    if 0 < len(pairs) <= len(topics.signals()):
         raise SelectionError(
             f"{topics.path} holds {len(pairs)} pairs of topics that may be measurement and "
             "command; choose one:",
             [(flags_of(y, u), reason) for y, u, reason in pairs],
         )
+    # More pairs than topics: the names say too little, and the topics are the shorter list.
     looks = {name: characterise(t.signal).text for name, t in topics.signals().items()}
+    number = f"{len(pairs)} pairs" if pairs else "no pair"
     raise SelectionError(
-        f"{topics.path} holds no recorded experiment and no pair of topics that looks like "
+        f"{topics.path} holds no recorded experiment and {number} of topics that may be "
         f"measurement and command; it has {topics.listing(looks)}; name two "
         f"with --measurement TOPIC[:FIELD] --command TOPIC[:FIELD]"
         + ("; or name a joint with --joint" if has_joints(topics) else "")
@@ -167,7 +169,7 @@ def plausible_pairs(
             continue
         if (
             (names[0] == measurement or _may_be_measurement(y, looks[names[0]].kind))
-            and (names[1] == command or _may_be_command(u, looks[names[1]].kind))
+            and (names[1] == command or _may_be_command(u, *(looks[name].kind for name in names)))
             and _overlap(y, u)
         ):
             named = (role_by_name(names[0]) == "measurement") + (
@@ -187,11 +189,13 @@ def _may_be_measurement(signal: Signal, kind: str) -> bool:
     return kind in ("steps", "varies") or (kind == "two-level" and role == "measurement")
 
 
-def _may_be_command(signal: Signal, kind: str) -> bool:
+def _may_be_command(signal: Signal, measurement_kind: str, kind: str) -> bool:
     role = role_by_name(signal.name)
     if role not in ("command", None):
         return False
-    return kind in ("two-level", "steps") or (kind == "varies" and role == "command")
+    # A controller's command varies as its measurement does, and then what steps is a set-point.
+    varies = kind == "varies" and (role == "command" or measurement_kind == "varies")
+    return varies or kind in ("two-level", "steps")
 
 
 def _overlap(measurement: Signal, command: Signal) -> bool:

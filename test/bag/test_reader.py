@@ -515,10 +515,24 @@ def test_two_pairs_are_listed_and_none_is_chosen(tmp_path):
 
 
 def test_no_pair_lists_the_topics_with_what_they_look_like(tmp_path):
-    write_many(tmp_path / "bag", {"/a": RAMP, "/b": RAMP, "/c": [5.0] * 20})
+    write_many(tmp_path / "bag", {"/a": RAMP, "/c": [5.0] * 20})
     with pytest.raises(
         SelectionError, match=r"no pair of topics .*/c \(std_msgs/msg/Float64, con"
     ):
+        read_experiments(tmp_path / "bag")
+
+
+@pytest.mark.parametrize(
+    ("measured", "said"),
+    [
+        ("/temperature", r"2 pairs .*\n.*--command /b .*\n.*--command /c "),
+        ("/a", r"4 pairs .*/b \(std_msgs/msg/Float64, varies .*; name two with"),
+    ],
+)
+def test_what_steps_may_be_the_set_point_of_a_command_that_varies(tmp_path, measured, said):
+    # The names do not tell which of two is the command, and a set-point gives a model of the loop.
+    write_many(tmp_path / "bag", {measured: RAMP, "/b": RAMP[::-1], "/c": [1.0] * 30 + [2.0] * 60})
+    with pytest.raises(SelectionError, match=said):
         read_experiments(tmp_path / "bag")
 
 
