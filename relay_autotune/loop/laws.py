@@ -253,8 +253,10 @@ _ROWS = (
 double Setpoint = 0.0, Input = 0.0, Output = StartOutput;
 PID controller(&Input, &Output, &Setpoint, Kp, Ki, Kd, POn, ControllerDirection);
 
-// at the end of setup(); then in loop(): read Input, controller.Compute(), write Output
-void startController() {
+// at the end of setup(), with what the sensor reads; then in loop(): read Input, give Setpoint,
+// controller.Compute(), write Output
+void startController(double measurement) {
+  Input = Setpoint = measurement;  // SetMode takes it for the last one
   controller.SetOutputLimits(OutputMin, OutputMax);
   controller.SetSampleTime(SampleTime);
   controller.SetMode(AUTOMATIC);

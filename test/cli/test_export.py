@@ -370,6 +370,8 @@ def test_an_arduino_sketch_compiles_and_starts_from_the_present_command(tmp_path
         500.0,
         1.0,
         start,
+        21.0,
+        21.0,
     ]
 
 
@@ -383,16 +385,19 @@ PID_V1 = """
 #define P_ON_E 1
 class PID {
  public:
-  PID(double*, double* output, double*, double p, double i, double d, int on, int direction)
-      : output(output) { std::printf("%g %g %g %d %d ", p, i, d, on, direction); }
+  PID(double* input, double* output, double* setpoint, double p, double i, double d, int on,
+      int direction)
+      : input(input), output(output), setpoint(setpoint) {
+    std::printf("%g %g %g %d %d ", p, i, d, on, direction);
+  }
   void SetOutputLimits(double low, double high) { std::printf("%g %g ", low, high); }
   void SetSampleTime(int period) { std::printf("%d ", period); }
-  void SetMode(int mode) { std::printf("%d %g", mode, *output); }
+  void SetMode(int mode) { std::printf("%d %g %g %g", mode, *output, *input, *setpoint); }
  private:
-  double* output;
+  double *input, *output, *setpoint;
 };
 """
-SHOW = "int main() { startController(); }"
+SHOW = "int main() { startController(21.0); }"
 
 
 def test_a_printer_reads_its_heater():
