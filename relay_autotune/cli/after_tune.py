@@ -300,9 +300,10 @@ class AfterTune(Tuned):
 
     def _designed(self, law: str, against: str) -> _Written:
         """Design gains for the law of a program, from the record of the tune, and show them."""
-        interval = f"{self.record.mean_interval:.3g}"
+        # One machine runs either program.
+        period = self.gains.law_period or float(f"{self.record.mean_interval:.3g}")
         what = f"time between two runs of {law} [s]"
-        period = asked(what, "--sample-period", interval, "0.1", _positive)
+        period = asked(what, "--sample-period", f"{period:g}", "0.1", _positive)
         with Working(f"designing for {law}") as working:
             found = self.analysed(working.at, law=law, sample_period=period)
         gains = found.best_gains

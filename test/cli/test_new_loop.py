@@ -794,8 +794,6 @@ def shown(
     """Return what is shown after a tune whose proof had an outcome and these answers came."""
     process = TransferFunction.fopdt(1.65, 1.0, 0.5)
     message, record = PidGains(), record_of(process, "x")
-    task = DesignTask(model=process, options=DesignOptions())
-    fill_gains(message, design(task, "imc"), experiment_id="x")
     result = Tune.Result(gains=message, verdict=Tune.Result.VERDICT_TRUSTED)
     result.experiment.settings.setpoint = 50.0
     result.transfer_function.noise_std = 0.02
@@ -829,8 +827,11 @@ def shown(
         export: str | None = None,
         accept_doubtful: bool = False,
         at_joint: bool = False,
+        **asked: Any,
     ) -> str:
         typed.extend(answers)
+        gains = design(DesignTask(model=process, options=DesignOptions(**asked)), "imc")
+        fill_gains(message, gains, experiment_id="x")
         given.command_within = command_within
         given.export, given.accept_doubtful = export, accept_doubtful
         result.bag = tempfile.mkdtemp(dir=tmp_path) if bag is None else bag
@@ -920,6 +921,14 @@ def test_a_program_that_is_named_gets_gains_of_its_own_and_a_start_without_a_bum
     other = shown(False, "it runs away", "px4_rate", "0.1", "px4.txt")
     assert "# DOUBTFUL: it runs away" in (tmp_path / "px4.txt").read_text()
     assert other.endswith("NEXT")
+
+
+def test_the_period_of_the_tune_is_that_of_another_program(
+    shown: Callable[..., str], tmp_path: Path
+) -> None:
+    asked = {"law": "simple_pid", "sample_period": 0.15}
+    shown(True, "", "arduino_pid_v1", "", "sketch.ino", **asked)
+    assert "const auto SampleTime = 150;" in (tmp_path / "sketch.ino").read_text()
 
 
 def test_somebody_without_a_controller_is_told_how_to_start_one(
