@@ -215,7 +215,7 @@ def _remarks_and_values(
         known = not math.isnan(target.present)
         present, rest = scale * target.present, f" The process rested at {target.present:.6g} u."
         if not known:
-            # A program that cannot do without one begins at the command next to 0.
+            # Code begins at the command next to 0, and says so.
             present = min(max(0.0, limits[0]), limits[1])
             rest = f" It is not known here: put it in place of {present:g}." * law.start.needs
         told += (f"Start without a bump: {law.start.words}{rest}",)

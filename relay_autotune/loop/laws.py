@@ -55,7 +55,7 @@ class Start:
     :param words: what to do, a sentence.
     :param name: the input that takes the value; empty: it has none.
     :param value: of that input, from the law with its gains and the command [u].
-    :param needs: True if its text does not work without a value.
+    :param needs: True if its text is code, which has a value to replace where none is known.
     """
 
     words: str
@@ -287,7 +287,7 @@ void startController(double measurement) {
             "# command = pid(measurement, dt=pid.sample_time)"
         ),
         bounds=lambda low, high: (("output_limits", f"({_or_none(low)}, {_or_none(high)})"),),
-        start=Start("starting_output is the present command.", "starting_output"),
+        start=Start("starting_output is the present command.", "starting_output", needs=True),
         ending="py",
     ),
     ProgramLaw(

@@ -490,16 +490,17 @@ def test_esphome_cools_by_its_negative_half():
 
 
 @pytest.mark.parametrize(
-    ("law", "name"),
+    ("law", "name", "unset"),
     [
-        ("simple_pid", "starting_output"),
-        ("esphome_pid", "starting_integral_term"),
-        ("iec_61131_3_pid", "X0"),
+        ("simple_pid", "starting_output", "0.0"),
+        ("esphome_pid", "starting_integral_term", None),
+        ("iec_61131_3_pid", "X0", None),
     ],
 )
-def test_a_program_starts_from_the_command_at_which_the_process_rests(law, name):
+def test_a_program_starts_from_the_command_at_which_the_process_rests(law, name, unset):
     unknown = exported(of_law(law, -2.0), law, Target())
-    assert "Start without a bump" in unknown and name not in settings_of(unknown)
+    assert "Start without a bump" in unknown and settings_of(unknown).get(name) == unset
+    assert ("It is not known here: put it in place of 0." in unknown) == (unset is not None)
     found = settings_of(exported(of_law(law, -2.0), law, Target(present=0.35)))
     # Before it runs, the block of IEC 61131-3 gives KP X0; the others' first output is theirs, of
     # which that of ESPHome is negative where it cools.
