@@ -20,6 +20,9 @@ from relay_autotune.control.verification import (
     rounded_up,
 )
 from relay_autotune.errors import TuningError
+from relay_autotune.loop.analysis import Loop
+from relay_autotune.loop.law import LawRate
+from relay_autotune.loop.laws import LAWS, OWN_LAW
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
@@ -161,15 +164,22 @@ class StepChoice:
         )
 
     def expected(self, step: float) -> str:
-        """Return the predicted range of the command with a step, for people.
+        """Return the predicted range of the command with a step and the noise, for people.
 
         :param step: of the set-point [y].
         :raises TuningError: as :func:`plan`.
         """
         assert self.record.settings is not None
-        rest = self.record.settings.baseline
-        low, high = sorted(self.command.clip(rest + step * end) for end in self._plan.command)
-        return f"from {low:.3g} to {high:.3g} u"
+        low, high = sorted(step * end for end in self._plan.command)
+        noise = NOISE_ALLOWANCE * self._noise * self._noise_gain
+        rest, clip = self.record.settings.baseline, self.command.clip
+        return f"from {clip(rest + low - noise):.3g} to {clip(rest + high + noise):.3g} u"
+
+    @property
+    def _noise_gain(self) -> float:
+        """Standard deviation of the command over that of the noise [u/y]."""
+        rate = self.control.rate or LawRate(LAWS[OWN_LAW], self.record.mean_interval)
+        return Loop(rate.of(self.control.gains), self.model).noise_gain()
 
     @property
     def _ways(self) -> tuple[float, float]:

@@ -26,6 +26,8 @@ from relay_autotune.control.verification import (
 )
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.law import LawRate
+from relay_autotune.loop.laws import LAWS
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
@@ -274,7 +276,8 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
     assert at_peak[0] < 2.0 - 3.0 * 0.02 < at_peak[1]
     # a step down is no other plan than one up, upside down
     down = plan(Control(gains), model, Step(setpoint=-0.7), 0.01).command
-    assert choice.expected(-0.7) == f"from {2.0 + down[0]:.3g} to {2.0 + down[1]:.3g} u"
+    quiet = replace(choice, noise_std=0.0)
+    assert quiet.expected(-0.7) == f"from {2.0 + down[0]:.3g} to {2.0 + down[1]:.3g} u"
     peak = replace(wanted, peak=1.2, visible=0.0)
     near = replace(choice, measurement=Limits(39.9, 40.05))
     vars(near)["_plan"] = peak
@@ -290,6 +293,32 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
     assert noisy.nearest(-0.02) == -0.03
     with pytest.raises(TuningError, match=r"less than 0\.03 y cannot be judged"):
         noisy.require(-0.02)
+
+
+@pytest.mark.parametrize("rate", [None, LawRate(LAWS["simple_pid"], 0.1)])
+def test_the_command_that_is_expected_holds_what_the_noise_does(rate):
+    """By a simulation in noise: a derivative makes more of it than of the step."""
+    time, noise_std = 0.1 * np.arange(2000.0), 0.15
+    control = Control(Controller(kc=1.2, ti=3.5, td=0.9, tf=0.0 if rate else 0.1), rate)
+    model = structure_named("three_lags").of_fields(
+        gain=3.0, time_constants=[6.0, 1.25, 0.4], dead_time=0.3
+    )
+    record = Record(
+        time=time, measurement=np.full(2000, 140.0), command=np.full(2000, 40.0),
+        settings=RelaySettings(140.0, 40.0, 10.0), noise_std=noise_std, cycle_start=(0, 900, 1800),
+    )  # fmt: skip
+    choice = StepChoice(
+        record, model, control, Limits(100.0, 200.0), Limits(0.0, 100.0), noise_std
+    )
+    (low, high), (least, most) = (
+        (float(told[1]), float(told[3]))
+        for told in (
+            each.expected(6.0).split() for each in (choice, replace(choice, noise_std=0.0))
+        )
+    )
+    noise = np.random.default_rng(5).normal(0.0, noise_std, 2000)
+    spread = 3.0 * float(np.std(run_loop(control, model, time, Step(), noise=noise).command))
+    assert (least - low, high - most) == pytest.approx((spread, spread), rel=0.1)
 
 
 @pytest.mark.long
