@@ -325,9 +325,12 @@ class TopicLoop(Loop):
     def _reader(self) -> Reader:
         """Return what reads the measurement; ask where the messages do not have that of --field.
 
+        Where none is given, it is the number that the messages are about, as for `replay`.
+
         :raises SelectionError: if nobody can be asked.
         """
         # Imported here, because it needs ROS.
+        from relay_autotune.bag.topics import only_field
         from relay_autotune.nodes.live_types import message_class, reader_of, struct_of
 
         options = self.options
@@ -336,8 +339,13 @@ class TopicLoop(Loop):
                 return reader_of(self._kind, options.field)
             except ParameterError as error:
                 told = as_flags(str(error))
-            kind = message_class(self._kind, "measurement_type")
-            first = "".join(first_numbers(struct_of(kind), 1))
+            root = struct_of(message_class(self._kind, "measurement_type"))
+            only = only_field(root)
+            if only and options.field == SETTING["field"].default != only:
+                print(f"using --field {only} of {root.name}", file=sys.stderr)
+                options.field = only
+                continue
+            first = "".join(first_numbers(root, 1))
             if not (first and sys.stdin.isatty()):
                 raise SelectionError(
                     f"{told}: give it, such as --field {first}" if first else told

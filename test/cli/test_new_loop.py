@@ -520,9 +520,9 @@ def test_units_that_are_typed_or_that_messages_say_stand_everywhere(
     for module in (loops, settings):
         monkeypatch.setattr(module, "UNITS", units)
     typed += ["35 %", "30 50", "0 to 100 %"]
-    arguments(Looker(kind="sensor_msgs/msg/Temperature", measures=44.0), options(
-        "--field", "temperature"
-    ))  # fmt: skip
+    found = arguments(Looker(kind="sensor_msgs/msg/Temperature", measures=44.0), options())
+    # The message is about one number, and its variance is not that.
+    assert found["measurement_field"] == "temperature"
     assert units == {"y": "°C", "u": "%"}
     assert broken("kc 0.6 u/y   i 2 u/(y s)   5 u", 99) == ["kc 0.6 %/°C   i 2 %/(°C s)   5 %"]
 
