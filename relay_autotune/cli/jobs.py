@@ -229,7 +229,8 @@ def _exported(
 def _target_from(target: Target, record: Record | None, shaping: Shaping | None) -> Target:
     """Return where gains go with units, noise, and the command at which a record rests."""
     if shaping is not None:
-        target = replace(target, noise_std=shaping.task.options.noise_std)
+        task = shaping.task
+        target = replace(target, noise_std=task.options.noise_std, model=task.held(task.model))
     if record is None:
         return target
     recorded = float(record.command.min()), float(record.command.max())

@@ -28,7 +28,10 @@ from relay_autotune.cli.settings import FLAGS, SETTING, Answers, as_flags
 from relay_autotune.cli.terminal import UNITS, Working, asked, broken, width
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
 from relay_autotune.exchange.export import Target
-from relay_autotune.exchange.messages import reason_from_message
+from relay_autotune.exchange.messages import (
+    reason_from_message,
+    transfer_function_from_message,
+)
 from relay_autotune.nodes.shell import typed_for_parameter
 from relay_autotune.nodes.tables import FIXED
 from relay_autotune.reasons import Code, Reason
@@ -495,6 +498,7 @@ class TopicLoop(Loop):
             command_max=high,
             present=options.at,
             noise_std=self.client.result.transfer_function.noise_std,
+            model=transfer_function_from_message(self.client.result.transfer_function),
             parameters={
                 **{name: value for name, value in sensor.items() if value != default[name]},
                 "safe_command": options.at,

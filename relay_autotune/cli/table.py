@@ -198,7 +198,8 @@ def beside(
     from relay_autotune.report.findings import compared_numbers
 
     now = None if present is None else performance_beside(present, gains, model, added_delay)
-    both = zip(compared_numbers(present, now), compared_numbers(gains, gains), strict=True)
+    old = compared_numbers(present, now, gains)
+    both = zip(old, compared_numbers(gains, gains, gains), strict=True)
     rows = [(name, old, new, unit) for (name, old, unit, _), (_, new, _, _) in both]
     lines = in_columns([("", "present", "new", ""), *rows], width)
     if present is not None:

@@ -20,6 +20,7 @@ from typing import Any
 from relay_autotune.errors import ParameterError, SelectionError
 from relay_autotune.loop.gains import Gains
 from relay_autotune.loop.laws import LAWS, OWN_LAW, ProgramLaw
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import result_fields
 from relay_autotune.text import digits, in_units, percent
 
@@ -46,6 +47,7 @@ class Target:
     :param noise_std: standard deviation of the measurement's noise [y]; NaN: not known.
     :param parameters: of a controller_node by name, besides gains and limits of the command.
     :param topics: names of the topics of a controller_node, by their names without a remapping.
+    :param model: the process, with the delay of its loop; None: not known.
     :param units: of the measurement, by "y", and of the command, by "u", as far as known.
     :param is_set_up: True if the gains are for its rate and its strategy against windup, which a
         joint_trajectory_controller cannot change while it runs.
@@ -60,6 +62,7 @@ class Target:
     present: float = math.nan
     recorded: tuple[float, float] = (math.nan, math.nan)
     noise_std: float = math.nan
+    model: TransferFunction | None = None
     parameters: Mapping[str, Any] = field(default_factory=dict)
     topics: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
@@ -366,20 +369,32 @@ def _comments(gains: Gains, target: Target, more: Sequence[str], remark: str) ->
         told.append(f"Designed for {gains.law} every {gains.law_period:.6g} s.")
         if not target.is_set_up:
             told[-1] += " If it runs at another period, export again with --sample-period."
-    told += [*_predicted(gains, target.noise_std), *gains.warnings]
+    told += [*_predicted(gains, target), *gains.warnings]
     return [f"{remark} {line}" for line in (*told, *more)]
 
 
-def _predicted(gains: Gains, noise_std: float) -> list[str]:
+def _predicted(gains: Gains, target: Target) -> list[str]:
     """Return sentences on what gains do on the model; those that are not known are left out."""
-    found = []
+    found, noise_std = list[str](), target.noise_std
     if math.isfinite(gains.settling_time):
-        jump = LAWS[gains.law or OWN_LAW].at(gains, gains.law_period).jump
+        # Here, for it loads scipy: a tune asks where gains go, and begins before that.
+        from relay_autotune.loop.analysis import Loop, as_run
+
+        law = as_run(gains, gains)
         found.append(
-            f"A step of the set-point overshoots by {percent(gains.overshoot)} %, settles within "
-            f"2 % after {digits(gains.settling_time, 3)} s, and moves the command at once by "
-            f"{digits(jump, 3)} u/y."
+            "Without noise and limits, a step of the set-point overshoots by "
+            f"{percent(gains.overshoot)} %, settles within 2 % after "
+            f"{digits(gains.settling_time, 3)} s, and moves the command at once by "
+            f"{digits(law.jump, 3)} u/y."
         )
+        if target.model and gains.settling_time and math.isfinite(target.present):
+            moves = Loop(law, target.model).command_range(2.0 * gains.settling_time)
+            rooms = [limit - target.present for limit in target.limits]
+            spans = [[room / move for room in rooms] for move in moves if move]
+            ends = ("down to", max(map(min, spans))), ("up to", min(map(max, spans)))
+            met = [f"{how} {digits(end, 2)}" for how, end in ends if math.isfinite(end)]
+            told = f"From {target.present:.6g} u steps {' and '.join(met)} y meet no limit."
+            found += [told] * bool(met)
     if gains.noise_gain * noise_std > 0.0:
         found.append(
             f"Noise of {digits(noise_std, 2)} y in the measurement makes one of "

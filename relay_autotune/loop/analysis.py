@@ -268,11 +268,7 @@ class Loop:
         finest = min(int(20.0 * duration * frequency / (2.0 * math.pi)), _MOST_POINTS // 8)
         points = max(_POINTS, 1 << finest.bit_length())
         while True:
-            if h > 0.0 and duration <= _MOST_SAMPLES * h:
-                samples = max(_LEAST_SAMPLES, 1 << int(duration / h).bit_length())
-                setpoint, load = self.step_responses(samples * h, samples)
-            else:
-                setpoint, load = self.step_responses(duration, points)
+            setpoint, load = self._responses(duration, points)
             final, offset, integrals = self._at_rest(frequency, setpoint)
             tails = (setpoint.measurement - final, load.measurement - offset)
             if all(_has_settled(tail) for tail in tails):
@@ -296,6 +292,23 @@ class Loop:
             effort_setpoint=abs(float(command[0])) + _variation(command),
             effort_load=_variation(load.command),
         )
+
+    def _responses(self, duration: float, points: int) -> tuple[ClosedLoop, ClosedLoop]:
+        """Return :meth:`step_responses` at the samples, for longer, where these are not many."""
+        h = self.law.period
+        if h > 0.0 and duration <= _MOST_SAMPLES * h:
+            samples = max(_LEAST_SAMPLES, 1 << int(duration / h).bit_length())
+            return self.step_responses(samples * h, samples)
+        return self.step_responses(duration, points)
+
+    def command_range(self, duration: float) -> tuple[float, float]:
+        """Return the smallest and the largest command after a unit step of the set-point [u/y].
+
+        :param duration: of the response [s].
+        """
+        setpoint, _ = self._responses(duration, _POINTS)
+        command = self._with_kicks(setpoint)
+        return float(command.min()), float(command.max())
 
     def _at_rest(
         self, frequency: float, setpoint: ClosedLoop
@@ -402,25 +415,33 @@ def analyse_loop(controller: ControlLaw, model: TransferFunction) -> Performance
     return Loop(controller, model).performance()
 
 
+def as_run(present: Controller, new: Gains | None) -> SampledLaw | Controller:
+    """Return gains of any origin as the law of new ones runs them.
+
+    :param present: the gains; where that law cannot run them, they run continuously.
+    :param new: those of the law; None: the present ones run continuously.
+    """
+    if new and new.law in LAWS:
+        with suppress(TuningError):
+            return LawRate(LAWS[new.law], new.law_period).of(present)
+    return present
+
+
 def performance_beside(
     present: Controller, new: Gains | None, model: TransferFunction, added_delay: float = math.nan
 ) -> Performance | None:
     """Return the performance of gains of any origin, run as new ones; None: the loop is unstable.
 
-    :param present: the gains; where the law of the new ones cannot run them, they run
-        continuously, with the dead time of its hold.
-    :param new: those that they are compared with; None: the present ones run continuously.
+    :param present: the gains, as of :func:`as_run`; where they run continuously they have the dead
+        time of the law's hold.
+    :param new: those that they are compared with, as there.
     :param model: the process.
     :param added_delay: dead time of the loop beside it [s]; NaN: that of the law's hold alone.
     """
-    rate = LawRate(LAWS[new.law], new.law_period) if new and new.law in LAWS else None
-    hold = rate.law.lag(rate.period) if rate else 0.0
-    delay = hold if math.isnan(added_delay) else added_delay
-    law: ControlLaw = present
-    if rate:
-        with suppress(TuningError):
-            law = rate.of(present)
-            delay -= hold
+    hold = LAWS[new.law].lag(new.law_period) if new and new.law in LAWS else 0.0
+    delay, law = hold if math.isnan(added_delay) else added_delay, as_run(present, new)
+    if isinstance(law, SampledLaw):
+        delay -= hold
     try:
         return analyse_loop(law, replace(model, dead_time=max(model.dead_time + delay, 0.0)))
     except TuningError:

@@ -103,6 +103,11 @@ class Controller:
         """
         return math.sqrt(self.ti * self.td) or self.ti
 
+    @property
+    def jump(self) -> float:
+        """Command just after a unit step of the set-point [u/y]."""
+        return self.kc * self.b
+
     def transfer_function(self) -> TransferFunction:
         """Return the controller from measurement to command, without its sign.
 

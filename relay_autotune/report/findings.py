@@ -9,8 +9,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from relay_autotune.loop.analysis import difference, performance_beside
-from relay_autotune.loop.gains import Controller, Performance
+from relay_autotune.loop.analysis import as_run, difference, performance_beside
+from relay_autotune.loop.gains import Controller, Gains, Performance
 from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import Case
 from relay_autotune.text import counted, date_text, digits, percent
@@ -165,8 +165,8 @@ def beside_present(case: Case) -> list[tuple[Compared, Compared]]:
     new, present = case.best_gains, case.present
     if case.model is None or new is None or present is None:
         return []
-    old = compared_numbers(present, performance_of(present, case))
-    return list(zip(old, compared_numbers(new, new), strict=True))
+    old = compared_numbers(present, performance_of(present, case), new)
+    return list(zip(old, compared_numbers(new, new, new), strict=True))
 
 
 def change_of(case: Case) -> str:
@@ -191,12 +191,16 @@ def performance_of(present: Controller, case: Case) -> Performance | None:
     return performance_beside(present, case.best_gains, case.model.model, case.added_delay)
 
 
-def compared_numbers(gains: Controller | None, does: Performance | None) -> list[Compared]:
+def compared_numbers(
+    gains: Controller | None, does: Performance | None, new: Gains | None
+) -> list[Compared]:
     """Return the numbers by which gains are compared.
 
     :param gains: the gains; None: there are none.
     :param does: what they do on the model; None: they make the loop unstable.
+    :param new: whose law runs them; None: they run continuously.
     """
+    jump = digits(as_run(gains, new).jump, 3) if gains else "-"
 
     def effect(name: str) -> str:
         if gains is None or does is None:
@@ -208,6 +212,7 @@ def compared_numbers(gains: Controller | None, does: Performance | None) -> list
     return [
         *((*each, "") for each in numbers),
         *((label, effect(name), unit, meaning) for label, name, unit, meaning in _EFFECTS),
+        ("jump of the command", jump, "u/y", "at once, by a unit step of the set-point"),
     ]
 
 

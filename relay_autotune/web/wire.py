@@ -145,7 +145,7 @@ def of_present(subject: PageModel) -> dict[str, Any]:
     case, before = subject.case, subject.before()
     if case.present is None or case.model is None:
         return {"rows": [], "steps": None}
-    rows = compared_numbers(case.present, performance_of(case.present, case))
+    rows = compared_numbers(case.present, performance_of(case.present, case), case.best_gains)
     steps = None
     if before is not None:
         steps = [short(each) for each in (before.time, before.measurement, before.command)]
@@ -191,7 +191,7 @@ def of_shaped(subject: PageModel, shaped: DesignResult) -> dict[str, Any]:
         "isa": [[n, digits(v), unit, meaning] for n, v, unit, meaning in isa],
         "parallel": [[n, digits(v), unit] for n, v, unit in parallel],
         "effects": _effects(shaped),
-        "beside": [value for _, value, *_ in compared_numbers(gains, gains)],
+        "beside": [value for _, value, *_ in compared_numbers(gains, gains, gains)],
         "at": short(np.array([gains.ms, gains.iae_load])),
         "b": gains.b,
         "ms": gains.ms,

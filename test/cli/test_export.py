@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from fopdt_plant import FopdtPlant
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -117,7 +118,27 @@ def test_an_export_says_what_was_predicted(capsys):
         assert [float(word) for word in told] == pytest.approx(predicted, rel=0.03)
     bare = exported(replace(gains(1.0, 2.0), noise_gain=3.0), "yaml", Target())
     assert "# The command has 3.00 u/y times the measurement's noise." in bare
-    assert "A step of" not in bare
+    assert "step of the set-point" not in bare
+
+
+@pytest.mark.parametrize("law", ["iec_61131_3_pid", "arduino_pid_v1", "control_toolbox_none"])
+@pytest.mark.parametrize("gain", [1.65, -1.65])
+def test_an_export_says_up_to_which_step_its_promise_holds(law, gain):
+    process = TransferFunction.fopdt(gain, 20.0, 10.0)
+    asked = DesignOptions(controller="pid", sample_period=0.5, law=law)
+    made = tune_model(process, "imc", options=asked)
+    oven = Target(command_min=0.0, command_max=100.0, present=40.0, model=process)
+    words = r"From 40 u steps down to (\S+) and up to (\S+) y meet no limit\."
+    (ends,) = re.findall(words, exported(made, law, oven))
+    for end in map(float, ends):
+        for share, fits in ((0.97, True), (1.03, False)):
+            running, plant = LAWS[law].at(made, 0.5).running(), FopdtPlant(gain, 20.0, 10.0)
+            command, commands = 0.0, []
+            for k in range(400):
+                command = running.step(share * end, plant.advance(0.5 * k, command))
+                commands.append(40.0 + command)
+            assert (min(commands) >= 0.0 and max(commands) <= 100.0) == fits
+    assert "meet no limit" not in exported(made, law, replace(oven, present=math.nan))
 
 
 def test_infinite_clamps_are_left_out():

@@ -796,7 +796,9 @@ def shown(
     message, record = PidGains(), record_of(process, "x")
     result = Tune.Result(gains=message, verdict=Tune.Result.VERDICT_TRUSTED)
     result.experiment.settings.setpoint = 50.0
-    result.transfer_function.noise_std = 0.02
+    found = result.transfer_function
+    found.structure, found.dead_time, found.noise_std = "general", 0.5, 0.02
+    found.numerator, found.denominator = [1.65], [1.0, 1.0]
     client: Any = SimpleNamespace(
         name="relay_node", result=result, record=lambda patience: record,
         identifier_values=lambda patience: None,
@@ -877,6 +879,7 @@ def test_gains_that_failed_are_not_recommended_and_their_file_says_so(
     text = (tmp_path / "passed.yaml").read_text()
     assert "DOUBTFUL" not in text and "command_max: 100.0" in text
     assert "# Noise of 0.020 y in the measurement makes one of 0.0" in text
+    assert "# From 35 u steps down to -" in text
     # It is what a controller_node of this loop starts with.
     words = with_gains_file(["--gains", "passed.yaml"])
     assert words[-1] == "controller_command:=/tank/valve"

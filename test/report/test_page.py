@@ -387,9 +387,12 @@ def test_the_present_gains_stand_beside_the_new_ones_with_what_both_do(monkeypat
     assert float(rows["Ms"][1]) == pytest.approx(case.best_gains.ms, rel=1e-2)
     assert "Beside the present gains" in read(page([replace(case, present=weak)])).text
     wild = replace(case, present=Controller(10.0 * case.best_gains.kc, 1.0))
-    assert beside_present(wild)[-1][0][1] == "unstable"
+    assert dict(row[0][:2] for row in beside_present(wild))["overshoot"] == "unstable"
     assert "loop unstable" in change_of(wild)
     assert rows["overshoot"][0] == f"{100.0 * expected.overshoot:.0f} %"
+    new = case.best_gains
+    jumps = [float(text) for text in rows["jump of the command"]]
+    assert jumps == pytest.approx([weak.kc, new.kc * new.b], rel=0.01)
     assert float(rows["settling time (2 %)"][1]) == pytest.approx(
         case.best_gains.settling_time, 0.01
     )
