@@ -372,7 +372,8 @@ def message_type(channel: Channel) -> Struct:
     """
     if channel.encoding != "cdr":
         raise BagError(
-            f"the messages of {channel.topic} are encoded as {channel.encoding!r}; expected 'cdr'"
+            f"the messages of {channel.topic} are encoded as {channel.encoding!r}; expected "
+            "'cdr', as ROS 2 writes them: write time, measurement and command as a CSV file"
         )
     try:
         return _Tree(_parsed(channel)).struct(channel.type, 0)

@@ -95,11 +95,12 @@ class Topics:
 
         :param looks: what else to say of some of them.
         """
-        known = looks or {}
-        described = (
-            f"{topic} ({kind}, {known[topic]})" if topic in known else f"{topic} ({kind})"
-            for topic, kind in sorted(self.types().items())
-        )
+        said = {
+            c.topic: "" if c.encoding == "cdr" else f", encoded as {c.encoding!r}"
+            for _, c in self._channels()
+        }
+        said |= {topic: f", {look}" for topic, look in (looks or {}).items()}
+        described = (f"{name} ({kind}{said[name]})" for name, kind in sorted(self.types().items()))
         first = ", ".join(islice(described, _MOST_LISTED))
         more = len(self.types()) - _MOST_LISTED
         return first + (f" and {more} more" if more > 0 else "") or "no topic"

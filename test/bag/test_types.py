@@ -441,8 +441,20 @@ def test_definitions_that_are_no_text():
     bad = Channel(1, "/t", "x/msg/A", "cdr", "ros2msg", b"float64 \xff", {})
     with pytest.raises(BagError, match="it is not UTF-8"):
         message_type(bad)
-    with pytest.raises(BagError, match="encoded as 'json'; expected 'cdr'"):
+
+
+def test_messages_of_other_encodings_are_named_with_a_way_out(tmp_path):
+    with pytest.raises(BagError, match=r"encoded as 'json'; expected 'cdr', .* as a CSV file"):
         message_type(channel("x/msg/A", "float64 a\n", encoding="json"))
+    path = tmp_path / "bag.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("Level", "jsonschema", b"{}")
+        writer.add_message(writer.register_channel("/level", "json", schema), 1, b"{}", 1)
+        writer.finish()
+    with McapFile(path) as file:
+        assert Topics(path, [file], "publish").listing() == "/level (Level, encoded as 'json')"
 
 
 def test_a_field_behind_too_many_others_is_refused_quickly():
