@@ -105,7 +105,9 @@ class TextTable:
             delimiter=separator,
             skipinitialspace=separator != "\t",
         )
-        self._commas = self._points = False
+        # Line and text of the first number with a decimal comma, and of the first with a point.
+        self._comma: tuple[int, str] | None = None
+        self._point: tuple[int, str] | None = None
         self._head: list[str] = []
         self._waiting: list[tuple[int, list[str]]] = []
         self.units: dict[str, str] = {}
@@ -272,12 +274,13 @@ class TextTable:
                     f"{self._path}: of {len(lines)} cells of {self.names[time]!r} {count} are "
                     f"{what}, the others not; expected one of them"
                 )
-        if self._commas and self._points:
+        if self._comma and self._point:
+            comma, point = (f"{c!r} in line {n}" for n, c in (self._comma, self._point))
             raise BagError(
-                f"{self._path} has numbers with a decimal comma and others with a point; "
-                "expected one of them"
+                f"{self._path} has numbers with a decimal comma and others with a point, such as "
+                f"{comma} and {point}; expected one of them"
             )
-        if self._commas:
+        if self._comma:
             self.notes.append("a comma within a number is taken as the decimal point")
         if untimed:
             self.notes.append(f"{untimed} rows without a time are left out")
@@ -353,9 +356,9 @@ class TextTable:
         if self._separator != ",":
             # "1.234,5" is neither.
             if "," in text and "." not in text and text.count(",") == 1:
-                text, self._commas = text.replace(",", "."), True
+                text, self._comma = text.replace(",", "."), self._comma or (line, cell)
             elif "." in text:
-                self._points = True
+                self._point = self._point or (line, cell)
         if not _is_number(text):
             raise self._no_number(line, at, cell)
         value = float(text)

@@ -165,7 +165,10 @@ def test_dates_in_seconds_become_the_start(tmp_path):
         ("y,u,v\n1,1,2\n2,2,3\n2,3,3\n1,3,3\n1,3,4\n", "'y' does not rise.*--period S"),
         ("t,setpoint,y\n0,1,2\n1,2,3\n", "'setpoint' seems to be a set-point"),
         ("stamp,y,u\n0,1,2\n10000,2,3\n", "steps by 10000 from row to row.*--time-unit s|ms"),
-        ("t;y;u\n0;1,5;2\n1;1.5;2\n", "a decimal comma and others with a point"),
+        (
+            "t;y;u\n0;1,5;2\n1;1.5;2\n",
+            "a decimal comma and others with a point, such as '1,5' in line 2 and '1.5' in line 3",
+        ),
         ("t;y;u\n0;1.000,5;2\n1;2;2\n", r"line 2: 'y' is '1.000,5'; expected a number"),
         ("t,y,u\n0,1,2\n2026-01-01T00:00:00,2,1\n", "of 2 cells of 't' 1 are dates"),
         ("t,y,u\n" + "0" * (1 << 20) + ",1,2\n", "a line of more than 1048576 characters"),
