@@ -269,11 +269,13 @@ def controller_file(gains: Gains, target: Target) -> str:
         law.line.format(name=name, value=number(value) if isinstance(value, float) else value)
         for name, value in target.parameters.items()
     ]
+    # A recording does not tell which topics are those of the controller.
+    names = " --ros-args -r measurement:=TOPIC -r controller_command:=TOPIC"
     if target.topics:
-        more += [f"{TOPICS}:", "  ros__parameters:"]
+        names, more = "", [*more, f"{TOPICS}:", "  ros__parameters:"]
     more += [law.line.format(name=n, value=json.dumps(to)) for n, to in target.topics.items()]
     text = "\n".join([settings(gains, law, target).rstrip(), *more])
-    return f"{law.remark} {OWN_LAW} --gains FILE\n{text}\n"
+    return f"{law.remark} {OWN_LAW} --gains FILE{names}\n{text}\n"
 
 
 def controller_values(gains: Gains, target: Target) -> dict[str, Any]:

@@ -223,7 +223,8 @@ class ControllerNode(ServedNode):
             f"ready: {controller_text(self._pid.gains)}, "
             f"{'automatic' if self._pid.is_automatic else 'holding its command'}; "
             f"commands go to {self._commands.topic_name}, held until somebody subscribes to it; "
-            f"set-points come on {self.resolve_topic_name('setpoint')}"
+            f"measurements come on {self.resolve_topic_name('measurement')}, "
+            f"set-points on {self.resolve_topic_name('setpoint')}"
         )
 
     # The loop.

@@ -204,6 +204,14 @@ def test_targets_that_cannot_be(wrong):
         Target(**wrong)
 
 
+def test_a_file_for_controller_node_begins_with_the_line_that_starts_it():
+    names = " --ros-args -r measurement:=TOPIC -r controller_command:=TOPIC"
+    topics = {"measurement": "/level", "controller_command": "/valve"}
+    for target, more in ((Target(), names), (Target(topics=topics), "")):
+        first, *_ = exported(of_law(""), "controller_node", target).splitlines()
+        assert first == f"# controller_node --gains FILE{more}"
+
+
 def test_plain_lines():
     found = yaml.safe_load(plain(gains(1e-5, 2.0), Target()))
     assert found["kc"] == pytest.approx(1e-5)
