@@ -154,7 +154,7 @@ def settings(gains: Gains, law: ProgramLaw, target: Target) -> str:
     """
     told, values = _remarks_and_values(gains, law, target)
     parts = [
-        *_comments(gains, target, told, law.remark),
+        *_comments(gains, target, (gains.reason and f"{gains.reason}.", *told), law.remark),
         law.head.format(node=_key(target.node), dof=_key(target.dof)),
         *(law.line.format(name=name, value=value) for name, value in values),
         law.tail,
@@ -220,7 +220,8 @@ def _remarks_and_values(
         if not known:
             # Code begins at the command next to 0, and says so.
             present = min(max(0.0, limits[0]), limits[1])
-            rest = f" It is not known here: put it in place of {present:g}." * law.start.needs
+            done = f": put it in place of {present:g}" if law.start.needs else ", and is left out"
+            rest = f" It is not known here{done}." * bool(law.start.name)
         told += (f"Start without a bump: {law.start.words}{rest}",)
         if law.start.name and (known or law.start.needs):
             values.append((law.start.name, law.start.value(at, present)))
@@ -298,7 +299,7 @@ def launch_file(gains: Gains, target: Target) -> str:
     shown = [f"                    {json.dumps(n)}: {v!r}," for n, v in values.items()]
     topics = [f"                    {(name, to)!r}," for name, to in target.topics.items()]
     lines = [
-        *_comments(gains, target, ("ros2 launch FILE",), "#"),
+        *_comments(gains, target, (gains.reason and f"{gains.reason}.", "ros2 launch FILE"), "#"),
         "from launch import LaunchDescription",
         "from launch_ros.actions import Node",
         "",
@@ -372,7 +373,7 @@ def _comments(gains: Gains, target: Target, more: Sequence[str], remark: str) ->
         if not target.is_set_up:
             told[-1] += " If it runs at another period, export again with --sample-period."
     told += [*_predicted(gains, target), *gains.warnings]
-    return [f"{remark} {line}" for line in (*told, *more)]
+    return [f"{remark} {' '.join(line.split())}" for line in (*told, *more) if line]
 
 
 def _predicted(gains: Gains, target: Target) -> list[str]:

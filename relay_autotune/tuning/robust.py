@@ -57,6 +57,8 @@ def robust(task: DesignTask) -> tuple[Controller, str]:
     else:
         derivative = options.controller == "pid" and search.differentiates
         found, why = _best(search, bounds, derivative), ""
+        if options.controller != "pi" and not derivative:
+            why = f"{search.rate.law.name} has no derivative"
     controller = found.controller
     # Where a double cannot count the samples of a response, the integral is as good as zero.
     duration = _duration(controller, search.model, search.frequency)

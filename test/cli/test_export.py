@@ -249,6 +249,7 @@ def test_replay_exports_the_gains_of_a_recording(capsys):
     assert replay.main(["--export", "pid_controller", "--pid", "bags/step_test"]) == 0
     text = capsys.readouterr().out
     assert "tf 0 s, b 1." in text and "Designed for pid_controller every 0.0985 s." in text
+    assert "# PID with the smallest IAE after a load step, with Ms <= 1.4 " in text
     for more in (["bags/step_test"], ["--json"]):
         assert replay.main([*asked, bag, *more]) == 2
         assert "one bag alone" in capsys.readouterr().err
@@ -529,7 +530,8 @@ def test_esphome_cools_by_its_negative_half():
 def test_a_program_starts_from_the_command_at_which_the_process_rests(law, name, unset):
     unknown = exported(of_law(law, -2.0), law, Target())
     assert "Start without a bump" in unknown and settings_of(unknown).get(name) == unset
-    assert ("It is not known here: put it in place of 0." in unknown) == (unset is not None)
+    done = ", and is left out." if unset is None else ": put it in place of 0."
+    assert f"It is not known here{done}" in unknown
     found = settings_of(exported(of_law(law, -2.0), law, Target(present=0.35)))
     # Before it runs, the block of IEC 61131-3 gives KP X0; the others' first output is theirs, of
     # which that of ESPHome is negative where it cools.
