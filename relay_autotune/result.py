@@ -68,6 +68,9 @@ class Shaping:
             pace_asked=not math.isnan(self.task.options.closed_loop_time),
         )
         found = judge(LOOP_CHECKS, replace(self.evidence, loop=loop))
+        if slow := self.task.too_slow:
+            # No other recording would help.
+            found = tuple(replace(f, remedy=f.remedy and slow) for f in found)
         return Judgement((*self.findings, *found))
 
 

@@ -155,6 +155,18 @@ class DesignTask:
     recorded_period: float = 0.0
 
     @property
+    def too_slow(self) -> str:
+        """A question about a controller that runs less often than the process answers, or ""."""
+        model, period, recorded = self.model, self.options.sample_period, self.recorded_period
+        if model.integrators or not 0.0 < model.response_time < period:
+            return ""
+        rows = f", the recording has a sample every {recorded:g} s" * (recorded > 0.0)
+        return (
+            f"the controller runs every {digits(period, 3)} s{rows}, and the process answers "
+            f"within {digits(model.response_time, 3)} s: is the sampling period in seconds?"
+        )
+
+    @property
     def process(self) -> TransferFunction:
         """The process as a continuous controller meets it, with the delay that the loop adds."""
         return replace(self.model, dead_time=self.model.dead_time + self.options.added_delay)
@@ -223,13 +235,7 @@ def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:
             f"{100.0 * noise / options.amplitude:.0f} % of half the command's range; filter the "
             "measurement, or ask for PI"
         )
-    model, period = task.model, options.sample_period
-    if not model.integrators and 0.0 < model.response_time < period:
-        found.append(
-            f"the controller runs every {digits(period, 3)} s, and the process answers within "
-            f"{digits(model.response_time, 3)} s: is the sampling period in seconds?"
-        )
-    return tuple(found)
+    return (*found, task.too_slow) if task.too_slow else tuple(found)
 
 
 # Less than this is not worth a sentence: factors, and a difference of overshoots.

@@ -302,6 +302,15 @@ def test_the_interval_of_a_csv_is_that_period_however_its_times_are_rounded(tmp_
     assert "the interval of the recording" in found["gains"][0]["reason"]
 
 
+def test_gains_for_a_period_in_milliseconds_do_not_blame_the_recording(tmp_path, capsys):
+    path = step_csv(tmp_path / "step.csv")
+    asked = ("--export", "oscat_ft_pid", "--sample-period", "500")
+    status, _, err = run(capsys, *FOPDT, *asked, path)
+    assert status == 1
+    assert "the controller runs every 500 s, the recording has a sample every 0.5 s" in err
+    assert "is the sampling period in seconds?" in err and "record for longer" not in err
+
+
 def test_a_csv_with_more_columns_gives_the_lines_to_copy(tmp_path, capsys):
     rows = step_csv(tmp_path / "step.csv").read_text().splitlines()
     path = tmp_path / "of five.csv"
