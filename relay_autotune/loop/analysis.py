@@ -475,7 +475,15 @@ def difference(
     :param model: the process.
     """
     if does is None:
-        return "the present gains make the loop unstable on the model"
+        told = "the present gains make the loop unstable on the model"
+        minutes = replace(present, ti=60.0 * present.ti, td=60.0 * present.td)
+        for meant, slip in (
+            (replace(present, kc=-present.kc), "is the sign of kc another one"),
+            (minutes, "are ti and td in minutes, not in seconds"),
+        ):
+            if performance_beside(meant, new, model) is not None:
+                return f"{told}; {meant} would not: {slip}?"
+        return told
     before, after = lasting_error(present, model), lasting_error(new, model)
     lasts = max(before, after) > 0.0
     if lasts:

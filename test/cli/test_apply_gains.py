@@ -83,6 +83,18 @@ def test_gains_that_are_missing_or_unstable_are_told_as_such() -> None:
     wild = "\n".join(beside(Controller(50.0, 0.1), GAINS, MODEL))
     assert wild.count("unstable") == 5
     assert "the present gains make the loop unstable on the model" in wild
+    assert "would not" not in wild
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        (Controller(-0.5, 25.0), "kc = 0.5, ti = 25 s would not: is the sign of kc another one?"),
+        (Controller(0.5, 0.02), "ti = 1.2 s would not: are ti and td in minutes, not in seconds"),
+    ],
+)
+def test_a_slip_in_the_present_gains_is_asked_about(typed: Controller, meant: str) -> None:
+    assert meant in " ".join(" ".join(beside(typed, GAINS, MODEL)).split())
 
 
 def test_a_verdict_has_five_lines() -> None:
