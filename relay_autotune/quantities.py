@@ -126,8 +126,15 @@ class Quantity:
             return f"{self.name} is {value:g}, expected a whole number"
         else:
             fine = self._includes(value)
+        if fine:
+            return None
         found = f"{value:g}" if self.is_number else repr(value)[:_SHOWN]
-        return None if fine else f"{self.name} is {found}, expected {self.range_text}"
+        # Imported here, since a start need not load it.
+        from difflib import get_close_matches
+
+        near = get_close_matches(str(value), self.choices, n=1)
+        expected = f"; did you mean {near[0]}?" if near else f", expected {self.range_text}"
+        return f"{self.name} is {found}{expected}"
 
     def _is_possible(self, size: float) -> bool:
         # What is infinite here is the default.

@@ -39,7 +39,7 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.loop.gains import FORMS, Controller, Gains
 from relay_autotune.loop.laws import LAWS
-from relay_autotune.quantities import declared
+from relay_autotune.quantities import Quantity, declared
 from relay_autotune.record.excitation import resting_command
 from relay_autotune.record.record import Record
 from relay_autotune.recordings import read_experiments
@@ -313,11 +313,9 @@ def design_options(options: argparse.Namespace) -> DesignOptions:
     """
     given = given_quantities(options, declared(DesignOptions))
     export = getattr(options, "export", None)
-    if export not in (None, *EXPORTS):
-        raise SelectionError(
-            f"--export {export!r} is no program that is known; expected one of "
-            f"{', '.join(EXPORTS)}"
-        )
+    problem = Quantity("--export", "", choices=("", *EXPORTS)).problem(export or "")
+    if problem is not None:
+        raise SelectionError(problem)
     if "law" not in given and export in LAWS:
         given["law"] = export
     return DesignOptions(**given)
