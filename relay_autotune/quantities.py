@@ -133,8 +133,8 @@ class Quantity:
         from difflib import get_close_matches
 
         near = get_close_matches(str(value), self.choices, n=1)
-        expected = f"; did you mean {near[0]}?" if near else f", expected {self.range_text}"
-        return f"{self.name} is {found}{expected}"
+        meant = f" (did you mean {near[0]}?)" if near else ""
+        return f"{self.name} is {found}{meant}, expected {self.range_text}"
 
     def _is_possible(self, size: float) -> bool:
         # What is infinite here is the default.

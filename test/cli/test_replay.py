@@ -407,7 +407,7 @@ def test_an_unknown_program_is_told_in_one_line_which_there_are(capsys, command)
     for flag in ("--export", "--law"):
         assert command.main([*given, flag, "simplepid"]) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert line.endswith(f"{flag} is 'simplepid'; did you mean simple_pid?")
+        assert f"{flag} is 'simplepid' (did you mean simple_pid?), expected one of" in line
 
 
 def test_csv_to_bag_refuses_what_it_cannot_do(tmp_path, capsys):
