@@ -31,7 +31,7 @@ from relay_autotune.cli.arguments import (
     given_quantities,
     say,
 )
-from relay_autotune.cli.table import compared_lines, rows, table
+from relay_autotune.cli.table import compared_lines, heading, rows, table
 from relay_autotune.cli.terminal import WIDEST, Working
 from relay_autotune.errors import NotThereError, RelayAutotuneError, SelectionError, defect
 from relay_autotune.exchange.export import EXPORTS, Target, exported
@@ -100,6 +100,7 @@ class Done:
     :param status: the exit status that it deserves.
     :param said: sentences for standard error.
     :param text: the table, or the document on one line; empty: there is none.
+    :param heading: the lines above a table of such texts; empty: there is none.
     :param error: why nothing was found; empty: something was.
     :param analyses: those of its experiments, in the process that made them.
     """
@@ -108,6 +109,7 @@ class Done:
     status: int
     said: tuple[str, ...]
     text: str
+    heading: str = ""
     error: str = ""
     analyses: tuple[Analysis, ...] = ()
 
@@ -154,7 +156,10 @@ def replay(job: Job, working: Working | None = None) -> Done:
             for a in analyses
             if not (a.models and job.table_width)
         ]
-    return Done(job.name, status, tuple(said), _text(job, analyses), analyses=analyses)
+    above, text = "", _text(job, analyses)
+    if job.name_width and analyses:
+        above = heading(job.name_width, analyses[0].record.units)
+    return Done(job.name, status, tuple(said), text, heading=above, analyses=analyses)
 
 
 def status_of(analyses: Sequence[Analysis]) -> int:
@@ -259,7 +264,8 @@ def _failed(job: Job, said: Sequence[str], why: str, status: int) -> Done:
         if any(p in why for p in (job.name, *map(visible, job.paths)))
         else f"{job.name}: {why}"
     )
-    return Done(job.name, status, (*said, sentence), _text(job, (), sentence), sentence)
+    text = _text(job, (), sentence)
+    return Done(job.name, status, (*said, sentence), text, error=sentence)
 
 
 def died(job: Job, how: str) -> Done:

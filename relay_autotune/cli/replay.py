@@ -38,7 +38,6 @@ from relay_autotune.cli.report import (
     command_line,
     write_report,
 )
-from relay_autotune.cli.table import heading
 from relay_autotune.cli.terminal import Working, require_new, width, write
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.gains import FORMS
@@ -154,9 +153,12 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     analyses: list[Analysis] = []
     cases: list[Case] = []
     named = options.measurement is not None or options.command is not None
-    if jobs[0].name_width:
-        write(f"{heading(jobs[0].name_width)}\n", None)
+    above = ""
     for done in _in_order(jobs, options):
+        # Rows of other units have a heading of their own.
+        if done.heading not in ("", above):
+            above = done.heading
+            write(f"{above}\n", None)
         if named or not jobs[0].name_width:
             _tell(done)
         if done.text:
@@ -195,8 +197,13 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
         # The workers of a cluster have working directories of their own.
         jobs = [replace(j, paths=tuple(str(Path(p).absolute()) for p in j.paths)) for j in jobs]
     if options.export:
-        if len(jobs) > 1 or not with_table:
-            raise SelectionError("--export writes the gains of one bag alone, without --json")
+        if len(jobs) > 1:
+            raise SelectionError(
+                f"--export writes the gains of one bag alone, and {len(jobs)} are given: name "
+                f"one, such as {jobs[0].name}"
+            )
+        if options.json:
+            raise SelectionError("--export writes a file of its own: leave out --json")
         target = export_target(options)
         jobs = [
             replace(

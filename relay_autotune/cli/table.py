@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -94,13 +94,15 @@ _NUMBERS = (
 )
 
 
-def heading(name_width: int) -> str:
+def heading(name_width: int, units: Mapping[str, str]) -> str:
     """Return the two lines above :func:`rows`.
 
     :param name_width: columns of the name.
+    :param units: of the measurement, by "y", and of the command, by "u", as far as they are known.
     """
-    names, units, _ = zip(*_NUMBERS, strict=True)
-    above = (("verdict", names), ("", units))
+    named = [(name, in_units(unit, units), unit, wide) for name, unit, wide in _NUMBERS]
+    words = [told if len(told) <= wide else unit for _, told, unit, wide in named]
+    above = (("verdict", [name for name, *_ in named]), ("", words))
     return "\n".join(_lines("", word, cells, name_width, WIDEST)[0] for word, cells in above)
 
 

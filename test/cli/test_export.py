@@ -250,9 +250,10 @@ def test_replay_exports_the_gains_of_a_recording(capsys):
     text = capsys.readouterr().out
     assert "tf 0 s, b 1." in text and "Designed for pid_controller every 0.0985 s." in text
     assert "# PID with the smallest IAE after a load step, with Ms <= 1.4 " in text
-    for more in (["bags/step_test"], ["--json"]):
-        assert replay.main([*asked, bag, *more]) == 2
-        assert "one bag alone" in capsys.readouterr().err
+    told = "one bag alone, and 2 are given: name one, such as bags/biased_relay"
+    for more, why in (("bags/step_test", told), ("--json", "leave out --json")):
+        assert replay.main([*asked, bag, more]) == 2
+        assert why in capsys.readouterr().err
     assert replay.main(["--ms", "9", bag]) == 2
     assert "--ms is 9, expected from 1.2 to 4" in capsys.readouterr().err
 

@@ -377,6 +377,16 @@ def test_everything_is_told_in_the_units_of_the_recording(tmp_path, capsys, monk
     assert record.units == {"u": "%"}
 
 
+def test_a_table_of_a_folder_has_the_units_of_its_recordings(tmp_path, capsys):
+    rows = step_csv(tmp_path / "a.csv").read_text().splitlines()
+    (tmp_path / "b.csv").write_text("\n".join(["Time (s),Level,Valve,Extra", *rows[1:]]))
+    _, out, _ = run(capsys, *FOPDT, "--rule", "imc", tmp_path)
+    head, units, a, again, bare, b = out.splitlines()
+    assert head == again and a.startswith("a.csv") and b.startswith("b.csv")
+    assert units.split()[:3] == ["%/m", "rad/s", "%/m"]
+    assert bare.split()[:3] == ["u/y", "rad/s", "u/y"]
+
+
 def test_names_given_for_several_apply_to_those_that_have_them(tmp_path, capsys, monkeypatch):
     asked = []
 
