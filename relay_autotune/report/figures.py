@@ -399,7 +399,7 @@ PLATES = (
         (_SAMPLES, _MODEL, _fit),
         "Above: the model over the measurement. Below: the residual. Good: the residual is as "
         "wide as the band and has no pattern. Bad: it repeats with each cycle (the structure is "
-        "too simple), or it drifts (a disturbance acted during the test).",
+        "too simple), or it drifts or jumps (a load came: end the record before it with --end).",
         lambda _: (4.9, 5.6),
     ),
     Plate(

@@ -142,6 +142,11 @@ def test_every_figure_is_there_for_broad_and_narrow_screens(whole: str) -> None:
         assert any(i.startswith(f"e1-{plate.key}-narrow-") for i in ids)
 
 
+def test_the_figure_that_shows_a_load_says_how_to_leave_it_out(whole: str) -> None:
+    # A recording cannot be repeated: the verdict alone says to keep other inputs constant.
+    assert "a load came: end the record before it with --end" in read(whole).text
+
+
 def test_colours_are_variables_with_a_value_for_light_and_dark(whole: str) -> None:
     drawings = "".join(re.findall(r"<svg.*?</svg>", whole, re.DOTALL))
     assert not re.search(r"#[0-9a-fA-F]{6}\b", drawings)
