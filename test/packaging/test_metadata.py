@@ -109,3 +109,11 @@ def test_executables_go_where_ros_looks():
     config.read(ROOT / "setup.cfg")
     expected = "$base/lib/relay_autotune"
     assert config["develop"]["script_dir"] == config["install"]["install_scripts"] == expected
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/install.md"])
+def test_the_line_for_a_laptop_installs_all_that_a_recording_may_need(page: str) -> None:
+    """A bag may be compressed, and mcap brings what reads that."""
+    (asked,) = re.findall(r"^pip install '\.\[(.*)\]'$", (ROOT / page).read_text(), re.MULTILINE)
+    optional = ast.literal_eval(setup_arguments()["extras_require"])
+    assert set(asked.split(",")) == optional.keys() - {"fleet", "test"}
