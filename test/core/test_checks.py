@@ -137,6 +137,14 @@ def test_an_actuator_that_pulls_less_than_it_pushes_is_told():
     assert max(gains) > 0.95 * MODEL.gain
 
 
+def test_unequal_effects_within_the_interval_of_the_gain_are_no_news():
+    found = identify_waveform(_record(0.95, noise=0.05), Known(structure="fopdt"))
+    above, below = found.effects
+    assert 0.0 < above - below < 0.06
+    assert found.ci95_high[0] > 1.03 * found.model.gain
+    assert not any("not linear" in told for told in found.warnings)
+
+
 def test_the_same_relay_on_a_model_acts_unequally_as_the_record_does():
     """The period of two equal effects is 8 % shorter, which spoke against the right model."""
     record = _record(0.6)

@@ -85,7 +85,9 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         prediction=scale * _prediction(records, problem, state),
     )
     quantile = student_95(n - state.parameters)
-    warnings = (*fit.warnings, *_warnings(records, quality, fit, residual))
+    at = estimate.structure.names.index("gain")
+    known_to = quantile * estimate.std[at] / abs(estimate.values[at])
+    warnings = (*fit.warnings, *_warnings(records, quality, fit, residual, known_to))
     found = identified(
         "waveform",
         estimate,
@@ -244,8 +246,16 @@ def _began_away(records: Sequence[Record], fit: Fit) -> bool:
 
 
 def _warnings(
-    records: Sequence[Record], quality: FitReport, fit: Fit, residual: FloatArray
+    records: Sequence[Record],
+    quality: FitReport,
+    fit: Fit,
+    residual: FloatArray,
+    known_to: float,
 ) -> list[str]:
+    """Return what is to be known of a model.
+
+    :param known_to: half the width of the gain's interval over the gain.
+    """
     found = []
     if fit.problem.colour is not None:
         found.append(
@@ -276,7 +286,7 @@ def _warnings(
                 f"{which}{record.lost_samples} samples were lost on the way; check the network"
             )
     above, below = fit.problem.effects(fit.state.coefficients)
-    if fit.problem.unequal:
+    if fit.problem.unequal and not abs(above - 1.0) <= known_to:
         found.append(
             f"commands above the first one act {above:.2f} times as strongly as in the model, "
             f"those below it {below:.2f} times: the process is not linear, and the gains hold on "
