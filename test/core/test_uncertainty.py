@@ -19,6 +19,7 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import Part
 from relay_autotune.identification.waveform.candidates import Candidate
+from relay_autotune.identification.waveform.determination import _combinations
 from relay_autotune.identification.waveform.fit_covariance import Fit, quantisation_step
 from relay_autotune.identification.waveform.posterior import _allowed, _apart, posterior
 from relay_autotune.identification.waveform.problem import problem_of
@@ -92,6 +93,13 @@ def test_combinations_are_told_where_parameters_are_not_determined():
     assert {"ultimate_gain", "ultimate_frequency"} <= set(named)
     assert any("bias" in a for a in found.advice)
     assert any("at rest" in a for a in found.advice)
+
+
+def test_the_sums_of_lags_say_that_a_zero_is_taken_off():
+    model = TransferFunction(1.0, zeros=(0.3,), time_constants=(2.0, 0.5), dead_time=0.1)
+    told = {name: of(model) for name, _, of in _combinations(model)}
+    assert told["dead_time + smaller lags - zero"] == pytest.approx(0.1 + 0.5 - 0.3)
+    assert told["dead_time + sum of lags - zero"] == pytest.approx(0.1 + 2.5 - 0.3)
 
 
 def _stepped(held: float, noise: float, process: TransferFunction) -> Record:

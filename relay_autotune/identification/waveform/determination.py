@@ -247,10 +247,11 @@ def _combinations(model: TransferFunction) -> list[_Combination]:
     if lags > 1:
         found.append(("gain/product of lags", f"y/(u{' s' * (model.integrators + lags)})", _high))
     small = lags if model.integrators else lags - 1
+    less = " - zero" * len(model.zeros)
     if small > 0 or model.zeros:
-        found.append(("dead_time + smaller lags", "s", _apparent_dead_time))
+        found.append((f"dead_time + smaller lags{less}", "s", _apparent_dead_time))
     if lags and model.is_stable:
-        found.append(("dead_time + sum of lags", "s", _residence))
+        found.append((f"dead_time + sum of lags{less}", "s", _residence))
     return found
 
 
