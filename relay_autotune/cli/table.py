@@ -336,11 +336,14 @@ def _known_all_the_same(found: Identification) -> list[_Entry]:
 def _others(analysis: Analysis) -> list[_Entry]:
     """Return what the other methods found, a line for each."""
     others = [model for i, model in enumerate(analysis.models) if i != analysis.selected]
-    lines = []
+    lines, instead = [], ""
+    chosen = None if analysis.model is None else analysis.model.validation
+    if chosen is not None and not chosen.reason:
+        instead = f" instead of {digits(100.0 * chosen.worst, 2)} %"
     for i, m in enumerate(others):
         note = f"{m.structure}, {m.method}"
         if m.validation is not None and not m.validation.reason:
-            note += f", limit cycle {digits(100.0 * m.validation.worst, 2)} % off"
+            note += f", limit cycle {digits(100.0 * m.validation.worst, 2)} % off{instead}"
         lines += _process("also" if i == 0 else "", m.model, note)
     return lines
 

@@ -33,6 +33,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import result_fields
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 from relay_autotune.result import Analysis
+from relay_autotune.text import digits
 
 MODEL = TransferFunction.fopdt(1.0, 2.0, 1.0)
 RELAY = RelaySettings(3.0, 1.0, 1.0, 0.0, 0.1)
@@ -107,7 +108,8 @@ def test_json_table_and_message_carry_all_of_it(record, models):
     text = table("x", [analysis])
     assert "limit cycle" in text
     assert "% of the signal" in " ".join(text.split())
-    assert "% off" in text
+    worst = [digits(100.0 * model.validation.worst, 2) for model in models[:2]]
+    assert f"limit cycle {worst[1]} % off instead of {worst[0]} %" in " ".join(text.split())
     header = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0))
     message = SimpleNamespace(header=header, verdict_why=SimpleNamespace())
     fill_transfer_function(message, models[2])
