@@ -311,7 +311,10 @@ def identified(
     point = ultimate_point(estimate.model)
     stds = (math.nan, math.nan)
     if point is None:
-        warnings = (*warnings, "the model has no ultimate point: no gain makes it oscillate")
+        warnings = (
+            *warnings,
+            "the model has no ultimate point: no proportional controller makes it oscillate",
+        )
     elif estimate.known:
         stds = estimate.ultimate_std(point.gain, point.frequency)
     return Identification(

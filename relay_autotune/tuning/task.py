@@ -233,7 +233,7 @@ def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:
         found.append(
             f"the noise alone moves the command by {noise:.3g} u (standard deviation), "
             f"{100.0 * noise / options.amplitude:.0f} % of half the command's range; filter the "
-            "measurement, or ask for PI"
+            "measurement, or ask for controller pi"
         )
     return (*found, task.too_slow) if task.too_slow else tuple(found)
 

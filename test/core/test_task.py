@@ -54,6 +54,15 @@ def test_a_held_sample_lags_by_half_a_period():
     assert DesignTask(model=IPDT.build((1.0, 1.0))).options.added_delay == 0.0
 
 
+def test_a_command_full_of_noise_is_told_with_the_option_that_helps():
+    process = TransferFunction(0.6, time_constants=(40.0, 12.0), dead_time=8.0)
+    asked = DesignOptions(sample_period=0.1, noise_std=0.5, amplitude=1.0)
+    task = DesignTask(model=process, options=asked)
+    (told,) = cautions(task.loop(Controller(0.5, 60.0, 9.0, 0.5)).performance(), task)
+    assert told.endswith("filter the measurement, or ask for controller pi")
+    assert DesignOptions(controller="pi").controller == "pi"
+
+
 @pytest.mark.parametrize(("period", "asks"), [(0.1, False), (100.0, True)])
 def test_a_period_in_milliseconds_is_asked_about(period, asks):
     process = TransferFunction(0.6, time_constants=(40.0, 12.0), dead_time=8.0)

@@ -266,7 +266,7 @@ def _warnings(
     step = coarse_step(records, quality.residual_rms)
     if step:
         found.append(
-            f"the measurement comes in steps of {step:.3g}, which are larger than its noise "
+            f"the measurement comes in steps of {step:.3g}, which are larger than the residual "
             f"({quality.residual_rms:.3g} rms): rounding is no noise, and the intervals are "
             "widened for it; a finer sensor or a larger amplitude would help"
         )

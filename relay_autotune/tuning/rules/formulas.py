@@ -124,8 +124,8 @@ def own_point(rule: str, task: DesignTask) -> UltimatePoint:
     point = ultimate_point(model)
     if point is None:
         raise TuningError(
-            f"the rule {rule} needs an ultimate point and the model has none (no gain makes it "
-            "oscillate): use imc or robust"
+            f"the rule {rule} needs an ultimate point and the model has none (no proportional "
+            "controller makes it oscillate): use imc or robust"
         )
     return point
 
