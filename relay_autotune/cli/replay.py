@@ -153,6 +153,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     analyses: list[Analysis] = []
     cases: list[Case] = []
     named = options.measurement is not None or options.command is not None
+    is_table = not (options.json or options.export or options.web)
     above = ""
     for done in _in_order(jobs, options):
         # Rows of other units have a heading of their own.
@@ -174,6 +175,10 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if analyses and options.report:
         write_report(as_asked(cases, options), options.report)
         say(PROGRAM, f"the report is {options.report}")
+    elif analyses and status != DONE and len(jobs) == 1 and is_table:
+        # A load, or a command of another loop, is seen at once.
+        figures = f"report{options.command_line.removeprefix(PROGRAM)} -o report.html"
+        say(PROGRAM, f"figures show why: {figures}")
     if analyses and options.web:
         shown = as_asked([case for case in cases if case.record is not None], options)
         shapings = [analysis.shaping for analysis in analyses]

@@ -459,7 +459,10 @@ def test_bad_recordings_end_with_one_line_and_status_1(tmp_path, capsys, name):
     assert status == 1
     assert err.startswith("replay: ")
     assert str(path) in err
-    assert err.count("\n") == 1
+    _, *more = err.splitlines()
+    # What has an experiment can be looked at.
+    figures = f"replay: figures show why: report {path} -o report.html"
+    assert more == [figures] * (name == "short.csv")
 
 
 @pytest.mark.parametrize(
