@@ -49,6 +49,8 @@ _MOST_FOR_SPEED = 2000
 # a share of its range.
 _NOISE = 4.0
 _SHARE = 0.05
+# A controller's command, which follows the noise and creeps at rest, moves far beyond this share.
+_FAR = 0.5
 
 # Least number of samples of a rest that shows the past; the largest share of its range by which
 # the measurement moves during it, and by which it would, going on like that, in the whole record.
@@ -442,21 +444,29 @@ def smooth(y: FloatArray) -> FloatArray:
 def _moving(
     record: Record, first: int, last: int, noise: float
 ) -> list[tuple[float, float, str, str]]:
-    """Return the part from where the measurement leaves its first rest to its last rest.
+    """Return the part from where measurement or command leaves its first rest to their last one.
 
-    A controller moves it by all that happens in between, however slowly.
+    A controller moves them by all that happens in between, however slowly. A command that moves
+    without an answer belongs to it: it speaks against a response.
     """
-    y = _without_outliers(record.measurement[first : last + 1])
+    y, u = (x[first : last + 1] for x in (record.measurement, record.command))
     if y.size < 5:
         return []
-    level = smooth(y)
-    reach = max(_NOISE * noise, _SHARE * float(np.ptp(y)))
+    moves = [*_off_the_ends(y, noise, _SHARE), *_off_the_ends(u, roughness(u), _FAR)]
+    if not moves:
+        return []
+    begin, end = min(m[0] for m in moves), max(m[1] for m in moves)
+    times = float(record.time[first + begin]), float(record.time[first + end])
+    return [(*times, "closed loop", "the command varies all the time")]
+
+
+def _off_the_ends(signal: FloatArray, noise: float, share: float) -> list[tuple[int, int]]:
+    """Return where a signal leaves its first level and comes to its last; empty: it rests."""
+    clean = _without_outliers(signal)
+    level, reach = smooth(clean), max(_NOISE * noise, share * float(np.ptp(clean)))
     leaves = np.flatnonzero(np.abs(level - level[0]) > reach)
     comes = np.flatnonzero(np.abs(level - level[-1]) > reach)
-    if not (leaves.size and comes.size):
-        return []
-    begin, end = record.time[first + leaves[0]], record.time[first + comes[-1] + 4]
-    return [(float(begin), float(end), "closed loop", "the command varies all the time")]
+    return [(int(leaves[0]), int(comes[-1]) + 4)] if leaves.size and comes.size else []
 
 
 # --- both

@@ -350,3 +350,22 @@ def test_rows_that_share_a_time_are_one_instant_of_the_command():
     fine = controlled(lambda t: 50.0 + 5.0 * (t > 300.0))
     shared = replace(fine, time=np.floor(fine.time / 4.0) * 4.0)
     assert {stretch.kind for stretch in find_experiments(shared)} == {"closed loop"}
+
+
+def test_a_closed_loop_lasts_as_long_as_its_command_moves_far():
+    """A command that got no answer speaks against a response: it is of another loop."""
+    rng = np.random.default_rng(5)
+    settled = 50.0 + 10.0 * np.exp(-np.maximum(TIME - 500.0, 0.0) / 20.0)
+    command = 30.0 * (TIME > 500.0) + 40.0 * ((TIME > 2200.0) & (TIME < 2300.0))
+    noise = rng.normal(0.0, 0.02, (2, TIME.size))
+    loop = Record(time=TIME, measurement=settled + noise[0], command=command + noise[1])
+    ((kind, _, end),) = spans(loop)
+    assert kind == "closed loop"
+    assert end > 2300.0
+    creeping = Record(
+        time=TIME,
+        measurement=settled + noise[0],
+        command=30.0 * (TIME > 500.0) + 2.0 * (TIME > 2200.0) + noise[1],
+    )
+    ((_, _, end),) = spans(creeping)
+    assert end < 2200.0
