@@ -31,7 +31,6 @@ from relay_autotune.identification.waveform.separable import (
     refine,
 )
 from relay_autotune.identification.waveform.starts import (
-    LASTING,
     Guess,
     best_of,
     coarse,
@@ -75,6 +74,9 @@ STEPS, _INSTANTS, _STEPS_IN_TIME = 15, 60, 4
 # Twice the logarithm of the prior odds against a term that can imitate a drift, for which a
 # record without one has no use: 150 to 1.
 IMITATES_A_DRIFT = 10.0
+# Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
+# zero of a slower inverse response as a drift.
+_LASTING = 2.0
 # Longest dead time in lengths of the record: a later response cannot be told from a drift.
 _LATE = 0.25
 # Longest of all: what came later than half of the record has nothing to confirm it.
@@ -243,7 +245,7 @@ class FitContext:
             return None
         if self.sign * model.process_sign < 0:
             # A relay of the wrong direction oscillates on the first answer of an inverse response.
-            if not any(-LASTING * self.length < z.real < 0.0 for z in model.zeros):
+            if not any(-_LASTING * self.length < z.real < 0.0 for z in model.zeros):
                 return None
         elif model.dead_time > self.latest[model.process_sign > 0]:
             return None
@@ -271,7 +273,7 @@ class FitContext:
         imitations = sum(nuisances_of(problem))
         if not self.held:
             # A relay bounds an integrator and what grows by itself, and shows both.
-            lasting = any(abs(t) > LASTING * self.length for t in model.time_constants)
+            lasting = any(abs(t) > _LASTING * self.length for t in model.time_constants)
             late = model.dead_time > _LATE * self.length
             imitations += lasting or late or self.is_turned(state) or not model.is_stable
             # The free rate of an integrator is what a free state is to a lag: one imitation.

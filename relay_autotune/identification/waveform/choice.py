@@ -439,28 +439,15 @@ def _finished(
     """Return the fit of a candidate to the end, in white noise to all samples."""
     own = candidate.problem
     if own.colour is not None:
-        state = _refined(own, candidate.state)
+        state = refine(own, candidate.state.theta)
     else:
         own = drop_first_dead_time(as_in(own, problem), candidate.state)
-        state = _refined(own, candidate.state)
+        state = refine(own, candidate.state.theta)
         if own.time.size > candidate.problem.time.size and _colour(own, state) is not None:
             # Samples so dense are correlated: those that were compared are not.
             own = candidate.problem
-            state = _refined(own, candidate.state)
+            state = refine(own, candidate.state.theta)
     if own.structure.model_at(state.theta, state.coefficients) is None:
         return None
     others = (c for c in found if c is not candidate)
     return Fit(own, state, (candidate, *others), scale)
-
-
-def _refined(problem: Problem, state: Trial) -> Trial:
-    """Return the best fit near another one, also across the kink at the first sample.
-
-    The sum of squares has a kink in the dead time wherever the answer to a switch meets a sample,
-    and may be least without any dead time.
-    """
-    fit = refine(problem, state.theta)
-    if not 0.0 < fit.theta[-1] < problem.shortest:
-        return fit
-    at_once = refine(problem, np.append(fit.theta[:-1], 0.0))
-    return min(fit, at_once, key=lambda s: s.cost)

@@ -37,9 +37,6 @@ from relay_autotune.record.record import Input, PiecewiseConstant
 _SAMPLES_A_SWING = 4.0
 # Shortest response of a process, in intervals between samples.
 _SHORTEST_RESPONSE = 0.5
-# Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and a
-# longer zero, or a later turn of an inverse response, as a drift.
-LASTING = 2.0
 # A response is seen where the measurement leaves the mean of a rest by this many times the range
 # of the rest, by this many of its standard deviations, and by this share of the whole range.
 _RANGES, _DEVIATIONS, _SHARE = 3.0, 6.0, 0.03
@@ -55,10 +52,10 @@ def is_unobservable(
     """Return whether a fit owes its small residual to what happens between the samples.
 
     It rings faster than the samples show: noise alone leads to such a resonance, of any height,
-    and it would limit every gain. Or its whole response falls between two samples, or comes from
-    an unreasonable zero: so a controller responds, where command and measurement were swapped. Or
-    its response turns into the direction of its gain later than any push of the command lasted:
-    what the record shows is the other direction, and the rest is a drift.
+    and it would limit every gain. Or its whole response falls between two samples: so a
+    controller responds, where command and measurement were swapped. Or its response turns into
+    the direction of its gain later than any push of the command lasted: what the record shows is
+    the other direction, and the rest is a drift.
 
     :param model: the fit.
     :param interval: between samples [s].
@@ -70,8 +67,6 @@ def is_unobservable(
     if any(c.imag != 0.0 and abs(c) < swing for c in model.time_constants):
         return True
     if not model.integrators and model.response_time < _SHORTEST_RESPONSE * interval:
-        return True
-    if any(abs(zero) > LASTING * length for zero in model.zeros):
         return True
     if not (model.is_stable or model.integrators) or all(zero.real >= 0.0 for zero in model.zeros):
         return False
