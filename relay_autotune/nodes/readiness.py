@@ -106,13 +106,14 @@ class Checklist:
         self.checks.append(ChecklistLine(Mark.OK, name, found(value)))
         return value
 
-    def tell(self, name: str, found: str | Reason) -> None:
+    def tell(self, name: str, found: str | Reason, mark: Mark = Mark.OK) -> None:
         """Add a line that is no reason not to start.
 
         :param name: what was looked at.
         :param found: what was found; as a reason, it is to be known.
+        :param mark: of a text.
         """
-        line = ChecklistLine(Mark.OK, name, str(found))
+        line = ChecklistLine(mark, name, str(found))
         if isinstance(found, Reason):
             line = ChecklistLine(Mark.NOTE, name, str(found), found)
         self.checks.append(line)
@@ -225,7 +226,7 @@ class Readiness:
         checks.tell("at rest", _rest_of(self._sensor.samples))
         checks.tell("recording", _recording_in(values["record_directory"]))
         checks.tell("model", _identifier_of(self._node, self._ends.gains.topic_name))
-        checks.tell("expected", _expected(parameters, self._sensor.samples, last))
+        checks.tell("expected", *_expected(parameters, self._sensor.samples, last))
         checks.tell("time", self.time_of(ready, parameters))
         return None if checks.refusals else ready
 
@@ -465,26 +466,37 @@ def _identifier_of(node: Node, topic: str) -> str | Reason:
 
 def _expected(
     parameters: ExperimentParameters, samples: LastSamples, last: tuple[float, Cycle] | None
-) -> str:
+) -> tuple[str, Mark]:
     """Say how far the measurement will swing: by the last tune, else as far as the levels grow.
+
+    A swing of given levels that goes beyond a limit is to be known: the tune would end there.
 
     :param parameters: the experiment's parameters.
     :param samples: the last measurements.
     :param last: amplitude of the last tune [u], and its last cycle; None: there is none.
     """
+    rest = samples.rest()
+    low, high = parameters.measurement_min, parameters.measurement_max
     if last is not None:
         amplitude, cycle = last
         ratio = parameters.amplitude / amplitude if parameters.amplitude else 1.0
         swing = cycle.amplitude * ratio
-        return f"a swing of about {swing:.2g} y each way in {duration(cycle.period)}, as last time"
-    low, high = parameters.measurement_min, parameters.measurement_max
+        told = f"a swing of about {swing:.2g} y each way in {duration(cycle.period)}, as last time"
+        if rest is None or parameters.finds_amplitude:
+            return told, Mark.OK
+        beyond = [f"{end:g}" for end in (low, high) if abs(end - rest.mean) < swing]
+        if not beyond:
+            return told, Mark.OK
+        ends = f"it would end the tune at {' or '.join(beyond)} y: give wider limits"
+        return f"{told}; {ends}, or a smaller amplitude", Mark.NOTE
     limits = [f"{limit:g}" for limit in (low, high) if math.isfinite(limit)]
     ends = f"; the tune ends at {' and '.join(limits)} y" if limits else ""
-    rest = samples.rest()
     if rest is None or not parameters.finds_amplitude:
-        return f"how far the measurement swings is not known before the first tune{ends}"
+        told = f"how far the measurement swings is not known before the first tune{ends}"
+        return told, Mark.OK
     seen, noise = np.array(samples.before()), rest.noise_std
     clear = clear_swing(noise, parameters.band(noise), seen)
     setpoint = rest.mean if math.isnan(parameters.setpoint) else parameters.setpoint
     swing = sought_swing(parameters, clear, noise, setpoint, seen)
-    return f"a swing of at least {swing:.2g} y each way, where the levels stop growing{ends}"
+    told = f"a swing of at least {swing:.2g} y each way, where the levels stop growing{ends}"
+    return told, Mark.OK

@@ -15,7 +15,7 @@ from virtual_tune import tuned
 
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.nodes import watch
-from relay_autotune.nodes.readiness import _expected, _rest_of
+from relay_autotune.nodes.readiness import Mark, _expected, _rest_of
 from relay_autotune.nodes.relay import RelayNode
 from relay_autotune.nodes.watch import (
     Arrival,
@@ -235,14 +235,18 @@ def test_the_swing_is_told_before_the_tune_that_makes_it(limit: float) -> None:
     samples = LastSamples()
     for k in range(100):
         samples.add(plant.measure(0.05 * k), round(1e9 * (100.0 + 0.05 * k)))
-    told = _expected(asked, samples, None)
+    told, _ = _expected(asked, samples, None)
     assert told.endswith(f"the tune ends at -{limit:g} and {limit:g} y")
     swing = float(told.partition("at least ")[2].partition(" y")[0])
     assert swing == pytest.approx(min(20.0 * noise, limit / 3.0), rel=0.15)
     *_, last = tuned(model, asked, period=0.05, seed=4, noise_std=noise).cycles
     assert 0.5 * (last.peak_max - last.peak_min) == pytest.approx(swing, rel=0.5)
     given = replace(asked, amplitude=1.0)
-    assert "not known before the first tune; the tune ends at" in _expected(given, samples, None)
+    told, _ = _expected(given, samples, None)
+    assert "not known before the first tune; the tune ends at" in told
+    told, mark = _expected(given, samples, (1.0, replace(last, peak_max=2.0, peak_min=-2.0)))
+    beyond = f"would end the tune at -{limit:g} or {limit:g} y"
+    assert (mark, beyond in told) == ((Mark.NOTE, True) if limit < 2.0 else (Mark.OK, False))
 
 
 def test_a_tune_is_asked_for_once_every_other_publisher_must_be_known() -> None:
