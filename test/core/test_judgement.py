@@ -18,7 +18,6 @@ from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.judgement.checks import (
-    lost_effect,
     read_backward,
 )
 from relay_autotune.identification.judgement.difference import difference
@@ -304,23 +303,6 @@ def clipped_steps(end):
     return Record(time=time, measurement=y, command=LEVELS(time), held_input=LEVELS)
 
 
-def test_commands_beyond_an_end_of_the_actuator_have_lost_their_effect():
-    # 1.5 is half of the range, which is one of the levels that are tried.
-    loss, level = lost_effect(clipped_steps(1.5), PROCESS)
-    assert loss == pytest.approx(1.0, abs=0.05)
-    assert level == 1.5
-    loss, _ = lost_effect(clipped_steps(9.0), PROCESS)
-    assert loss < 0.05
-    # Between two levels alone there is nothing to compare.
-    two = PiecewiseConstant(np.array([20.0, 80.0]), np.array([1.0, 0.0]), 0.0)
-    plain = clipped_steps(9.0)
-    assert lost_effect(replace(plain, held_input=two), PROCESS) is None
-    # A third level that stood for one sample tells no more.
-    times = np.array([0.25, 80.0, 160.0])
-    three = PiecewiseConstant(times, np.array([1.0, -1.0, 1.0]), 0.0)
-    assert lost_effect(replace(plain, held_input=three), PROCESS) is None
-
-
 def fed_back(process, gain, *, steps=2000):
     """Record a proportional controller beside noise at the process's input."""
     plant = VirtualProcess(process)
@@ -359,17 +341,6 @@ def test_a_command_from_outside_is_not_fed_back(command):
 def test_an_answer_between_few_samples_is_not_trusted(record, gains, tau, result):
     found = fitted_as(TransferFunction.fopdt(2.0, tau, 0.1), record)
     assert finding("resolution", record, found, gains).result is result
-
-
-def test_levels_near_one_another_do_not_tell_what_is_lost_beyond_them():
-    # A heater that warms faster than it cools: but for 0 and 10, its command has two levels.
-    time = np.arange(0.0, 600.0, 1.0)
-    command = np.select([time < 10, time < 200, time < 400], [0.0, 150.0, 10.0], 150.0)
-    record = Record(time=time, measurement=np.zeros(time.size), command=command)
-    heater = TransferFunction.fopdt(0.3, 110.0, 15.0)
-    warm = response(heater, time, record.input())
-    record = replace(record, measurement=warm - 0.004 * warm**2)
-    assert lost_effect(record, heater) is None
 
 
 @pytest.mark.nightly

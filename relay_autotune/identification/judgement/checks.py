@@ -7,98 +7,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.identification.waveform.residuals import effective_sample_fraction
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import PiecewiseConstant, Record
+from relay_autotune.record.record import Record
 
 _SURE = 4.5
 _LEAST_ASYMMETRY = 0.05
 _OTHER_AMPLITUDE = 1.2
 # Least number of samples in a cycle: with fewer, straight lines between them miss more than 1 %.
 _LEAST_SAMPLES = 24
-# Levels at which the effect of a command may end, in shares of its range; beside its first level.
-_SHARES = (0.25, 0.5, 0.75)
 # Relative difference up to which curves count as the same.
 _ALIKE = 1e-6
-_LEVELS, _MOST_SAMPLES, _SURE_LOSS = 3, 2000, 3.0
-# Least range of the command on one side but for few samples [%], as a share of the whole range.
-_BUT_FEW, _OWN = (1.0, 99.0), 0.2
 # Earlier samples that a controller's law may hold, a PID's with a filter, and the last samples of
 # a record that are looked at.
 _PAST, _MOST_CHANGES = 3, 20_000
-
-
-def lost_effect(
-    record: Record, model: TransferFunction, fitted: FloatArray | None = None
-) -> tuple[float, float] | None:
-    """Return how much of their effect commands lose on one side of a level, and that level.
-
-    The parts of the command above and below a level get a gain each, a and b, in the least-squares
-    sense; the loss is ``(|a - b| - 3 sigma)/max(|a|, |b|)``, with sigma the standard deviation of
-    the difference, at the level where it is largest. Where an actuator is at its end it is 1.
-
-    :param record: any record.
-    :param model: the model fitted to it.
-    :param fitted: the fitted measurement [y], shape (n,), NaN where there is none. What of it is
-        no response, as a way back to rest, has a size of its own. None: offset and drift alone.
-    :return: None where the command has two levels alone, samples are few, or the process grows
-        by itself.
-    """
-    if model.grows or len(record) < _LEAST_SAMPLES:
-        return None
-    u = record.input()
-    levels = np.unique(np.append(u.values, u.initial))
-    if levels.size < _LEVELS or not np.ptp(levels) > 0.0:
-        return None
-    few = np.unique(np.linspace(0, len(record) - 1, _MOST_SAMPLES).astype(np.int64))
-    part = replace(
-        record,
-        time=record.time[few],
-        measurement=record.measurement[few],
-        command=record.command[few],
-        receive_time=np.empty(0),
-        command_time=np.empty(0),
-        cycle_start=(),
-    )
-    beside = []
-    if fitted is not None and len(fitted) == len(record):
-        beside.append((fitted - response(model, record.time, u))[few])
-    inner = levels[0] + np.array(_SHARES) * np.ptp(levels)
-    held = u(record.time)
-    found = []
-    for level in (*inner, u.initial):
-        if not levels[0] < level < levels[-1]:
-            continue
-        # A level of a single sample is no move.
-        sides = [held[side] for side in (held >= level, held <= level) if np.any(side)]
-        own = max(float(np.ptp(np.percentile(side, _BUT_FEW))) for side in sides)
-        if own < _OWN * float(np.ptp(levels)):
-            # Where no side has moves of its own, each part is the other one scaled and shifted.
-            continue
-        parts = [
-            response(
-                model,
-                part.time,
-                PiecewiseConstant(
-                    u.times, keep(u.values - level, 0.0), keep(u.initial - level, 0)
-                ),
-            )
-            for keep in (np.maximum, np.minimum)
-        ]
-        (above, below), covariance = _factors(part, parts, beside, correlated=True)
-        contrast = np.array((1.0, -1.0))
-        sigma = math.sqrt(max(float(contrast @ covariance @ contrast), 0.0))
-        largest = max(abs(above), abs(below))
-        if largest > 0.0:
-            loss = (abs(above - below) - _SURE_LOSS * sigma) / largest
-            found.append((float(max(loss, 0.0)), float(level)))
-    return max(found, default=None)
 
 
 def read_backward(record: Record, model: TransferFunction) -> float | None:
@@ -160,9 +86,9 @@ def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> st
     for record in records:
         u = record.input()
         swings.append(0.5 * float(np.ptp(np.append(u.values, u.initial))))
-        factor, covariance = _factors(record, [response(model, record.time, u)])
-        gains.append(float(factor[0]))
-        deviations.append(math.sqrt(max(float(covariance[0, 0]), 0.0)))
+        factor, deviation = _factor(record, response(model, record.time, u))
+        gains.append(factor)
+        deviations.append(deviation)
     least, most = int(np.argmin(swings)), int(np.argmax(swings))
     if not swings[most] > _OTHER_AMPLITUDE * swings[least]:
         return None
@@ -176,34 +102,20 @@ def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> st
     )
 
 
-def _factors(
-    record: Record,
-    parts: Sequence[FloatArray],
-    beside: Sequence[FloatArray] = (),
-    *,
-    correlated: bool = False,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the factors of some responses in a record, and their covariance.
+def _factor(record: Record, answer: FloatArray) -> tuple[float, float]:
+    """Return the factor of a response in a record, and its standard deviation.
 
-    An offset and a drift are estimated beside them.
+    An offset and a drift are estimated beside it.
 
-    :param parts: each of the record's length.
-    :param beside: further curves of free size, NaN where they are not known.
-    :param correlated: True: correlated samples count less.
+    :param answer: of the record's length.
     """
     line = record.time - record.time.mean()
-    columns = np.stack((*parts, np.ones(len(record)), line, *beside))
-    known = np.isfinite(columns).all(axis=0)
-    columns, measured = columns[:, known], record.measurement[known]
+    columns = np.stack((answer, np.ones(len(record)), line))
     size = np.sqrt(np.einsum("kn,kn->k", columns, columns))
     size[size == 0.0] = 1.0
     scaled = columns / size[:, None]
-    # A further curve that is offset and drift alone adds nothing.
-    factors, *_ = np.linalg.lstsq(scaled.T, measured, rcond=_ALIKE)
-    residual = measured - factors @ scaled
-    variance = float(residual @ residual) / measured.size
-    if correlated:
-        variance /= effective_sample_fraction(residual)
-    covariance = np.linalg.pinv(scaled @ scaled.T, rcond=_ALIKE**2) * variance
-    count = len(parts)
-    return factors[:count] / size[:count], (covariance / np.outer(size, size))[:count, :count]
+    factors = np.linalg.lstsq(scaled.T, record.measurement, rcond=_ALIKE)[0]
+    residual = record.measurement - factors @ scaled
+    covariance = np.linalg.pinv(scaled @ scaled.T, rcond=_ALIKE**2)
+    variance = float(residual @ residual) / residual.size * float(covariance[0, 0])
+    return float(factors[0] / size[0]), math.sqrt(max(variance, 0.0)) / float(size[0])

@@ -16,10 +16,7 @@ import numpy as np
 
 from relay_autotune.identification.estimate import student_95
 from relay_autotune.identification.judgement.assessment import unexplained_share
-from relay_autotune.identification.judgement.checks import (
-    lost_effect,
-    read_backward,
-)
+from relay_autotune.identification.judgement.checks import read_backward
 from relay_autotune.identification.judgement.difference import LEAST_SAMPLES
 from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence
 from relay_autotune.record.cycles import limit_cycle
@@ -143,14 +140,9 @@ def _left_out(evidence: Evidence) -> Measured:
     return Measured(float(np.isnan(fitted).mean()) if len(fitted) else 0.0)
 
 
-def _clipped(evidence: Evidence) -> Measured | None:
-    found, record = evidence.found, evidence.record
-    weak, strong = sorted(found.effects)
-    if weak < strong:
-        # Estimated with the model, about the first level.
-        return Measured(1.0 - weak / strong, f"{record.input().initial:.4g}")
-    lost = lost_effect(record, found.model, found.fitted)
-    return None if lost is None else Measured(lost[0], f"{lost[1]:.4g}")
+def _clipped(evidence: Evidence) -> Measured:
+    weak, strong = sorted(evidence.found.effects)
+    return Measured(1.0 - weak / strong, f"{evidence.record.input().initial:.4g}")
 
 
 MODEL_CHECKS = (
@@ -242,8 +234,7 @@ MODEL_CHECKS = (
     Check(
         name="clipped",
         title="Clipping",
-        what="share of their effect that commands surely lose on one side of a level; above 1 "
-        "they act the other way there",
+        what="share of their effect that commands lose on one side of the first one",
         unit="",
         doubtful=0.6,
         sentence="commands on one side of {detail} lose {value} of the effect that those on the "

@@ -34,19 +34,6 @@ def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
     return np.asarray(products[1:] / products[0])
 
 
-def effective_sample_fraction(residual: FloatArray) -> float:
-    """Return the number of independent samples that one correlated sample is worth, up to 1.
-
-    With a correlation rho of neighbours, n samples tell no more than ``n (1 - rho)/(1 + rho)``
-    independent ones.
-
-    :param residual: shape (n,), in the order of time.
-    """
-    n = residual.size
-    rho = float(autocorrelation(residual, 1)[0])
-    return min(max((1.0 - rho) / (1.0 + rho), 1.0 / n), 1.0)
-
-
 def noise_to_signal(noise: FloatArray, signal: FloatArray) -> tuple[float, float]:
     """Return the two noise-to-signal ratios of Wang, Hang and Zou 1997.
 
