@@ -8,7 +8,6 @@ This module is loaded after the tune, since that takes long.
 
 from __future__ import annotations
 
-import math
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -169,10 +168,7 @@ class Proof:
             raise TuningError("the limits leave no room for a step: widen --within")
         self.step: float = options.step or choice.allowed.nearest(step)
         choice.allowed.require(self.step)
-        # How long the loop takes to settle with the gains, and all of it [s].
-        known = math.isfinite(gains.settling_time)
-        self._settles = gains.settling_time if known else choice.lasts
-        self._takes = choice.lasts + (SETTLES + 1.0) * self._settles
+        self._takes = choice.lasts + (SETTLES + 1.0) * choice.settles
 
     @property
     def allowed(self) -> StepRange:
@@ -256,13 +252,13 @@ class Proof:
         :param show: called with the samples of the step.
         """
         self.allowed.require(step)
-        patience = max(_TIMES_SETTLING * self._settles, _REST_WITHIN)
+        patience = max(_TIMES_SETTLING * self._choice.settles, _REST_WITHIN)
         with self._started(doubtful) as controller:
             tell(f"starting {CONTROLLER}")
             controller.find(START_WITHIN, leave)
             with controller.offered(self._message) as gains:
                 found = controller.prove(step, 0.0, patience, tell, leave, gains)
-                controller.let_settle(self._settles, tell, "the loop goes back", leave)
+                controller.let_settle(self._choice.settles, tell, "the loop goes back", leave)
             show(controller.steps_of(found))
         return found
 

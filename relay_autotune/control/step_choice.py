@@ -21,6 +21,7 @@ from relay_autotune.control.verification import (
 )
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop
+from relay_autotune.loop.gains import Gains
 from relay_autotune.loop.law import LawRate
 from relay_autotune.loop.laws import LAWS, OWN_LAW
 from relay_autotune.loop.sampled import Limits
@@ -143,6 +144,16 @@ class StepChoice:
     def lasts(self) -> float:
         """How long a step is observed [s]."""
         return self._plan.duration
+
+    @property
+    def settles(self) -> float:
+        """How long the loop takes to settle with gains of a design [s].
+
+        NaN in the design: as long as a step is observed; 0: the gains are in force already.
+        """
+        if not isinstance(gains := self.control.gains, Gains):
+            return 0.0
+        return gains.settling_time if math.isfinite(gains.settling_time) else self.lasts
 
     @cached_property
     def allowed(self) -> StepRange:

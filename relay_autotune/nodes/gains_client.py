@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 
 from relay_autotune.control.controller import Control
 from relay_autotune.control.step_choice import StepChoice, StepRange
-from relay_autotune.control.verification import noise_of
+from relay_autotune.control.verification import SETTLES, noise_of
 from relay_autotune.errors import LoopError
 from relay_autotune.exchange.messages import (
     gains_from_message,
@@ -440,6 +440,6 @@ class StepsHere:
         fails = ("if it fails", "The gains before come back by themselves.")
         if self.choice is None:
             return ("moves", moves), fails
-        told, lasts = self.choice.expected(step), duration(self.choice.lasts)
-        expected = f"The command is expected {told}, for about {lasts}."
+        takes = duration(SETTLES * self.choice.settles + self.choice.lasts)
+        expected = f"The command is expected {self.choice.expected(step)}; it takes about {takes}."
         return ("moves", moves), ("expected", expected), fails

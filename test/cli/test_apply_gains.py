@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from relay_autotune.cli import apply_gains
@@ -20,15 +21,20 @@ from relay_autotune.cli.apply_gains import found_entries, verdict_entries
 from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import labelled
-from relay_autotune.control.step_choice import StepRange
+from relay_autotune.control.controller import Control, Step
+from relay_autotune.control.step_choice import StepChoice, StepRange
+from relay_autotune.control.verification import plan
 from relay_autotune.errors import LoopError, TuningError
 from relay_autotune.exchange.messages import fill_gains, fill_reason
 from relay_autotune.loop.analysis import performance_beside
 from relay_autotune.loop.gains import Controller
+from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes.gains_client import StepsHere
 from relay_autotune.nodes.verifier import without_arrays
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code
+from relay_autotune.record.record import Record, RelaySettings
+from relay_autotune.text import duration
 from relay_autotune.tuning import design
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.web.live import PROVE, VERIFY, Live, PageCommand
@@ -217,6 +223,21 @@ def test_without_a_record_of_a_tune_the_node_alone_refuses_a_step() -> None:
     assert "expected" not in plan and "come back" in plan["if it fails"]
     with pytest.raises(TuningError, match="expected other than 0"):
         unknown.plan(0.0)
+
+
+def test_a_plan_counts_the_time_in_which_the_loop_settles_with_new_gains() -> None:
+    """The node waits for 1.5 settling times of new gains, then makes a step; 6 s were left out."""
+    record = Record(
+        time=0.1 * np.arange(401.0), measurement=np.full(401, 40.0), command=np.full(401, 2.0),
+        settings=RelaySettings(40.0, 2.0, 1.0), noise_std=0.0, cycle_start=(0, 200, 400),
+    )  # fmt: skip
+    limits = Limits(0.0, 80.0), Limits(0.0, 5.0)
+    present = Controller(GAINS.kc, GAINS.ti, GAINS.td, GAINS.tf, GAINS.b)
+    step = plan(Control(GAINS), MODEL, Step(setpoint=1.0), 0.1).duration
+    for gains, settling in ((GAINS, 1.5 * GAINS.settling_time), (present, 0.0)):
+        choice = StepChoice(record, MODEL, Control(gains), *limits, 0.0)
+        told = dict(StepsHere(choice, 0.0).plan(0.5))["expected"]
+        assert told.endswith(f" u; it takes about {duration(settling + step)}.")
 
 
 def client_of(prove: Any, in_force: Any) -> Any:
