@@ -190,7 +190,7 @@ class _LoopOnPage:
         """Say what a wish would do, or why it cannot be done; nothing moves."""
         self._live.tell(phase="checking")
         plan = self._check(wish) if wish.what == START else self._gains.plan(wish)
-        self._live.forget_wishes()
+        self._live.forget_questions()
         self._live.tell(phase="idle", plan=replace(plan, number=wish.dry))
 
     def _check(self, wish: PageCommand) -> PagePlan:

@@ -218,11 +218,13 @@ class Live:
     def wish(self, wish: PageCommand) -> None:
         """Take a wish of a page.
 
-        :param wish: during a tune or a verification only its end can be wished.
+        :param wish: during a tune or a verification only its end can be wished; while the plan of
+            another page is looked at, what was agreed to waits for its turn.
         """
+        phase = self.told.phase
         if wish.what == ABORT:
             self.abort.set()
-        elif self.told.phase == "idle":
+        elif phase == "idle" or (phase == "checking" and not wish.dry):
             self._wishes.put(wish)
 
     def next_wish(self) -> PageCommand | None:
@@ -236,6 +238,13 @@ class Live:
         """Drop what was wished before a tune began or ended, such as by a second click."""
         while self.next_wish():
             pass
+        self.abort.clear()
+
+    def forget_questions(self) -> None:
+        """Drop what was only asked while a plan was looked at, which its page asks again."""
+        for wish in list(iter(self.next_wish, None)):
+            if not wish.dry:
+                self._wishes.put(wish)
         self.abort.clear()
 
     def everything(self) -> dict[str, Any]:

@@ -61,7 +61,7 @@ from relay_autotune.text import in_units
 from relay_autotune.tuning import design
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import Verdict
-from relay_autotune.web.live import Live, PageCommand
+from relay_autotune.web.live import Live, PageCommand, PagePlan
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains
 
@@ -614,6 +614,25 @@ def test_a_plan_that_relay_node_refuses_marks_the_answer_to_change() -> None:
     plan = shown._live.told.plan
     assert plan.refusal.startswith("refused: ") and plan.refused == "at"
     assert [line[:2] for line in plan.lines] == [("note", "limits"), ("NO", "levels")]
+
+
+def test_what_one_page_agrees_to_while_the_plan_of_another_is_looked_at_is_done() -> None:
+    """It was dropped, and its page showed nothing of it."""
+    live, agreed = Live("tank"), PageCommand("revert")
+    shown: Any = _LoopOnPage.__new__(_LoopOnPage)
+    shown._live = live
+
+    def looked_at(wish: PageCommand) -> PagePlan:
+        live.wish(agreed)
+        # its page asks again
+        live.wish(PageCommand("verify", dry=8))
+        return PagePlan()
+
+    shown._gains = SimpleNamespace(plan=looked_at)
+    live.wish(PageCommand("verify", dry=9))
+    shown._show_plan(PageCommand("verify", dry=7))
+    assert live.next_wish() == agreed
+    assert live.next_wish() is None
 
 
 def test_a_form_that_can_be_goes_to_relay_node_as_numbers() -> None:
