@@ -322,6 +322,7 @@ def test_on_a_phone_a_wish_shows_what_comes_of_it_and_a_model_stands_once(tmp_pa
         assert not tab.eval("document.querySelector('#live-process').checkVisibility()")
         # nothing moves under the pointer any more
         tab.wait("document.body.dataset.settled === 'yes'")
+        tab.eval("import('/plot.js').then(({units}) => { units.y = 'K'; }), 0")
         # what it would do is asked first; a step that cannot be made is changed where it stands
         tab.click("#prove")
         asked = tab.until(live.next_wish, "the wish")
@@ -332,6 +333,7 @@ def test_on_a_phone_a_wish_shows_what_comes_of_it_and_a_model_stands_once(tmp_pa
                                                  (form,)))  # fmt: skip
         tab.wait("document.querySelector('#form-step-0')?.ariaInvalid === 'true'")
         assert tab.text("#plan-said") == "9 y, expected -3 to 4 y"
+        assert tab.text("#form label") == "step of the set-point [K]"
         assert tab.eval("document.activeElement.id") == "form-step-0"
         assert tab.eval("document.querySelector('#plan-yes').disabled")
         tab.eval("document.activeElement.value = ''; 0")

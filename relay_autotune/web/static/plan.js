@@ -3,6 +3,8 @@
 
 // The plan: what will be done, what is asked for it, and whether it is agreed to.
 
+import { inUnits } from "./plot.js";
+
 const $ = (id) => document.getElementById(id);
 // Time without a key after which what was typed is looked at [ms].
 const TYPED = 500;
@@ -120,7 +122,7 @@ export class Plan {
     for (const { name, question, unit, values, ends, now, needed } of this.form) {
       const row = document.createElement("div");
       const label = document.createElement("label");
-      label.textContent = `${question} [${unit}]`;
+      label.textContent = inUnits(`${question} [${unit}]`);
       row.append(label);
       const fields = document.createElement("span");
       for (let k = 0; k < ends; k += 1) {

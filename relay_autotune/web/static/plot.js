@@ -42,7 +42,7 @@ function range(values) {
 // What y and u stand for, by their letters.
 export const units = {};
 
-function axisTitle(label) {
+export function inUnits(label) {
   return (label || "").replace(/\[(.*)\]/, (all, unit) => `[${unit.replace(/[yu]/g, (letter) => units[letter] || letter)}]`);
 }
 
@@ -111,9 +111,9 @@ export class Plot {
         .textContent = text;
     }
     element("text", { class: "axis", x: (left + width - right) / 2, y: height - 4, "text-anchor": "middle" }, svg)
-      .textContent = axisTitle(this.words.x);
+      .textContent = inUnits(this.words.x);
     element("text", { class: "axis", transform: `translate(12 ${(top + height - below) / 2}) rotate(-90)`, "text-anchor": "middle" }, svg)
-      .textContent = axisTitle(this.words.y);
+      .textContent = inUnits(this.words.y);
     const inside = element("g", { "clip-path": `url(#${clip})` }, svg);
     const at = (x, y) => `${px(x).toFixed(1)} ${py(y).toFixed(1)}`;
     if (what.areas && what.areas.length) {
