@@ -127,7 +127,7 @@ class GainsPage:
                 steps = self._steps(message)
                 step = step or steps.step
                 lines += [("", *line) for line in steps.plan(step)]
-                lines.append(("", "allowed", steps.allowed.words))
+                lines.append(("", "steps", steps.allowed.words))
         except RelayAutotuneError as error:
             refusal = str(error)
         asked = {"name": "step", "question": "step of the set-point", "unit": "y", "ends": 1,
@@ -232,8 +232,9 @@ class GainsPage:
     def _verify(self, controller: GainsClient, step: float, new: Controller | None) -> None:
         live = self.live
         self._begin_step("")
+        # The page has a button that takes them back.
         result, entries = verified(
-            controller, step, lambda text: live.tell(status=text), self.leave, new
+            controller, step, lambda text: live.tell(status=text), self.leave, new, stays=False
         )
         self._show_steps(controller.steps_of(result))
         self._rest("verification", result, entries)

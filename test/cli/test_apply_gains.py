@@ -293,7 +293,7 @@ def test_the_page_refuses_a_step_beyond_the_limits_before_anything_changes() -> 
     controller: Any = SimpleNamespace(
         in_force=lambda: Controller(0.1, 3.0), steps=lambda gains: StepsWithin(2.0),
         offered=changed.append, prove=lambda *words: changed.append(words),
-        name="/controller_node", find=lambda patience: None,
+        name="/controller_node", find=lambda patience: None, steps_of=lambda result: [],
     )  # fmt: skip
     loop: Any = SimpleNamespace(
         proves=False, client=SimpleNamespace(controllers=lambda: ["/controller_node"])
@@ -312,7 +312,13 @@ def test_the_page_refuses_a_step_beyond_the_limits_before_anything_changes() -> 
         usual = page.plan(PageCommand(what, dry=2))
         assert (usual.refusal, usual.form[0]["values"]) == ("", [2.0])
         assert ("", "expected", "The command goes to 2 u.") in usual.lines
+        # not a range of the measurement
+        assert ("", "steps", StepRange(-1.5, 2.0).words) in usual.lines
     assert not changed
+    # what takes them back is a button of the page, not another command
+    controller.prove = lambda *words: Verify.Result(passed=True, steps=[step()])
+    page.do(PageCommand(VERIFY, step=1.0))
+    assert live.told.proof[-1] == ("gains in force", "kc 0.1000, ti 3.000, td 0")
 
 
 def test_a_command_line_that_does_not_fit_ends_with_two() -> None:

@@ -317,7 +317,7 @@ export class Live {
     if (!(this.loop && this.told && (this.told.controller || this.told.proves))) return;
     const { controller, present, phase } = this.told;
     const new_ = this.offered();
-    $("force-now").textContent = controller ? `${controller} has ${present}` : "Nobody controls this loop: a controller of this command makes one step, and ends.";
+    $("force-now").textContent = controller ? `${controller} has ${present}` : "Nobody else controls this loop: a controller of this command makes one step, and ends.";
     $("force-new").textContent = new_ ? `${controller ? "To apply" : "To prove"}: ${new_.words}${new_.doubtful ? ", which are doubtful" : ""}.` : "The page shows no gains that could be applied.";
     $("prove").disabled = $("apply").disabled = !(phase === "idle" && new_);
     $("verify").disabled = $("revert").disabled = phase !== "idle";
