@@ -32,6 +32,7 @@ from relay_autotune.report.findings import (
     warnings_of,
 )
 from relay_autotune.report.style import in_steps, thinned
+from relay_autotune.result import Shaping
 from relay_autotune.text import digits, percent, visible
 from relay_autotune.tuning.task import DesignOptions
 from relay_autotune.verdict import Verdict
@@ -97,7 +98,7 @@ def of_subject(subject: PageModel) -> dict[str, Any]:
         "around": len(subject.shaping.task.models) if subject.shaping is not None else 0,
         "first": of_asked(subject.first),
         "slider": [CALM, FAST, STEP],
-        "noisy": subject.shaping is not None and _knows_noise(subject.shaping.task.options),
+        "amplitude": _noisy_amplitude(subject.shaping),
     }
 
 
@@ -132,8 +133,10 @@ def of_running(
     return found
 
 
-def _knows_noise(options: DesignOptions) -> bool:
-    return options.noise_std > 0.0 and options.amplitude > 0.0
+def _noisy_amplitude(shaping: Shaping | None) -> float:
+    """Return what the noise in the command is a part of [u]; 0: none is known to be limited."""
+    options = DesignOptions() if shaping is None else shaping.task.options
+    return options.amplitude if options.noise_std > 0.0 and options.amplitude > 0.0 else 0.0
 
 
 def of_present(subject: PageModel) -> dict[str, Any]:

@@ -62,6 +62,9 @@ def test_the_slider_by_keyboard_alone_and_a_page_that_is_loaded_again(browser, u
 def test_kinds_rules_and_weight_by_mouse(browser, url, subject):
     tab = browser.tab(url)
     shown(tab)
+    value, unit = tab.text("#noise-value").split()
+    known = subject.shaping.task.options
+    assert (float(value), unit) == (pytest.approx(known.noise_share * known.amplitude, 0.06), "u")
     tab.click("input[value=pi]")
     expected = told(subject, DesignRequest(controller="pi"))
     tab.until(lambda: shown(tab).startswith(expected), expected)

@@ -76,6 +76,12 @@ function ask() {
   socket.send(JSON.stringify({ of: chosen, n: number, asked }));
 }
 
+function showNoise() {
+  const share = asked.noise_share;
+  $("noise-value").textContent = `${(share * subjects[chosen].amplitude).toPrecision(2)} ${units.u || "u"}`;
+  $("noise-part").textContent = `(${(100 * share).toFixed(0)} % of half its range in the test)`;
+}
+
 function showControls() {
   const subject = subjects[chosen];
   const [low, high, step] = subject.slider;
@@ -98,10 +104,10 @@ function showControls() {
   $("own-weight").checked = own;
   $("weight").disabled = own;
   if (!own) $("weight").value = asked.setpoint_weight;
-  $("noise").hidden = !subject.noisy;
+  $("noise").hidden = !subject.amplitude;
   Object.assign($("noise-share"), { max: Math.max(0.5, asked.noise_share) });
   $("noise-share").value = asked.noise_share;
-  $("noise-value").textContent = `${(100 * asked.noise_share).toFixed(0)} %`;
+  showNoise();
   $("law").replaceChildren();
   for (const law of laws) {
     const option = put($("law"), "option", law || "none in particular");
@@ -442,7 +448,7 @@ for (const input of document.querySelectorAll("input[name=controller]")) {
 }
 $("noise-share").addEventListener("input", () => {
   asked.noise_share = Number($("noise-share").value);
-  $("noise-value").textContent = `${(100 * asked.noise_share).toFixed(0)} %`;
+  showNoise();
   ask();
 });
 $("law").addEventListener("change", () => { asked.law = $("law").value; ask(); });
