@@ -261,7 +261,10 @@ class RelayExperiment:
         """Expected time until the end [s]; NaN before the first whole cycle."""
         if self.finished:
             return 0.0
-        return self.cycles_left * self.cycles[-1].period if self.cycles else math.nan
+        if not self.cycles:
+            return math.nan
+        last = self.cycles[-1]
+        return max(last.start + (1 + self.cycles_left) * last.period - self.elapsed, 0.0)
 
     @property
     def progress(self) -> float:

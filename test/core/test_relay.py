@@ -299,6 +299,20 @@ def test_live_cycles_and_those_of_the_record_are_equal_bit_for_bit():
         assert record.command[start - 1] == record.settings.low
 
 
+def test_the_time_that_is_left_runs_down_within_a_cycle():
+    """It stood still until the end of each cycle."""
+    tune, plant, command = experiment(), FopdtPlant(1.0, 1.0, 1.0), 0.0
+    k, ends = 0, {}
+    while not tune.finished:
+        command = tune.step(0.02 * k, plant.advance(0.02 * k, command))
+        ends.setdefault(tune.cycle_count, []).append(0.02 * k + tune.remaining)
+        k += 1
+    assert tune.remaining == 0.0
+    assert np.isnan(ends.pop(0)).all()
+    # The end that is expected stays, until the next cycle tells more.
+    assert len(ends) > 2 and all(np.ptp(told) < 1e-9 for told in list(ends.values())[:-1])
+
+
 def test_progress_grows_from_0_to_1():
     tune, plant, command, progress = experiment(), FopdtPlant(1.0, 1.0, 1.0), 0.0, []
     k = 0
