@@ -240,7 +240,10 @@ class Loop:
             return f"the safe command was sent, but {others} commands, too, and goes on"
         if self.client.result.why.code in (Code.SILENT_SENSOR, Code.SENSOR_GONE):
             return "the safe command was sent, and no measurement shows whether the plant has it"
-        return ""
+        if self.has_own_nodes:
+            return ""
+        controllers = self.client.others_on("controller_command")
+        return f"the safe command was sent, and {controllers} commands again" * bool(controllers)
 
     def other_commander(self) -> str:
         """Return who else commanded during a tune that ended for that; empty: nobody."""

@@ -192,7 +192,7 @@ def result_lines(
     :param cancelled: True if this command cancelled it.
     :param paint: the look of text.
     :param columns: that a line may have.
-    :param left: at which command the plant is left, where that is known.
+    :param left: in which state the plant is left.
     """
     outcome = "cancelled" if cancelled else OUTCOMES[result.outcome]
     colour = {"completed": _GREEN}.get(outcome, _RED)
@@ -203,8 +203,8 @@ def result_lines(
     first, *rest = labelled("tune", told, columns)
     lines = [first.replace(outcome, paint(outcome, f"{_BOLD};{colour}"), 1), *rest]
     if outcome != "completed":
-        left = left or "the plant is left at the safe command"
-        lines += labelled("", f"{left}; no gains are given", columns)
+        told = "; ".join(filter(None, (left, "no gains are given")))
+        lines += labelled("", told, columns)
     if result.transfer_function.experiment_id:
         found = identification_from_message(result.transfer_function)
         lines += ["", *identification_lines(found, columns)]

@@ -87,7 +87,7 @@ class Tuned:
     def left(self) -> str:
         """How the plant is left by a tune that was not completed; empty: it was."""
         ended = self.result.outcome == self.result.COMPLETED and not self.client.cancelled
-        return "" if ended else self.loop.left()
+        return "" if ended else self.loop.left() or "the plant is left at the safe command"
 
     def lines(self, paint: Paint, columns: int = WIDEST) -> list[str]:
         """Return the result as lines.

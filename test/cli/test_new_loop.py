@@ -1092,6 +1092,9 @@ def test_after_a_tune_beside_another_program_its_command_is_not_said_to_be_the_l
     first, again = AfterTune(loop, parser).repeated(None)
     assert first == ("first", "end /pid, which commands /u") and again[0] == "run it again"
     assert Loop(client, given).left().startswith("the safe command was sent, but a node not known")
+    # relay_node passes on what comes on controller_command as soon as a tune has ended
+    client.result = ended(Code.CANCELLED())
+    assert Loop(client, given).left() == "the safe command was sent, and /pid commands again"
 
 
 def test_a_plant_that_has_gone_is_not_said_to_be_left_at_the_safe_command() -> None:

@@ -317,7 +317,8 @@ def test_a_report_of_a_tune_is_what_the_identifier_would_say(monkeypatch, tmp_pa
 def test_a_tune_without_gains_offers_none() -> None:
     why = ReasonMessage(code=Code.CANCELLED)
     stopped = result(outcome=Tune.Result.ABORTED, reason="cancelled", why=why, bag="/records/x")
-    text = "\n".join(result_lines(stopped, True, Paint()))
+    left = "the plant is left at the safe command"
+    text = "\n".join(result_lines(stopped, True, Paint(), left=left))
     assert "cancelled" in text and "cancelled: cancelled" not in text
     assert "safe command; no gains are given" in text
     assert next_commands(stopped, ["/c"]) == []
