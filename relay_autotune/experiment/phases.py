@@ -387,8 +387,8 @@ class Kick:
         rest, limit = self._facts.rest.mean, self._facts.settled_at + self._limit - self._begun
         wait = f", for {duration(limit)} at most" if math.isfinite(limit) else ""
         return (
-            f"stepped to {self.command:g}, no response after {duration(t - self._begun)}: the "
-            f"measurement {y:.6g} is to leave {rest:.6g} -/+ {self._detector.band:.2g}{wait}"
+            f"stepped to {self.command:g} u, no response after {duration(t - self._begun)}: the "
+            f"measurement {y:.6g} y is to leave {rest:.6g} -/+ {self._detector.band:.2g} y{wait}"
         )
 
 
@@ -429,8 +429,8 @@ class Probe:
         """Say what it waits for and sees."""
         return (
             f"the measurement went {'up' if self._facts.side > 0 else 'down'} after "
-            f"{duration(self._facts.response_time)}; at {self._setup.trace.command[-1]:g} it is "
-            f"{y:.6g}, and shows whether it stays on that side, for "
+            f"{duration(self._facts.response_time)}; at {self._setup.trace.command[-1]:g} u it is "
+            f"{y:.6g} y, and shows whether it stays on that side, for "
             f"{duration(max(self.latest - t, 0.0))} at most"
         )
 

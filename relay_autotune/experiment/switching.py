@@ -278,8 +278,8 @@ class Switching:
         rises = relay.is_high == (facts.sign > 0)
         target = facts.setpoint + (facts.hysteresis if rises else -facts.hysteresis)
         return (
-            f"{now}; at {self.command:g} for {duration(since)}{longer}: the measurement "
-            f"{y:.6g} is to {'rise' if rises else 'fall'} to {target:.6g}"
+            f"{now}; at {self.command:g} u for {duration(since)}{longer}: the measurement "
+            f"{y:.6g} y is to {'rise' if rises else 'fall'} to {target:.6g} y"
         )
 
     # Stays of the relay.

@@ -51,9 +51,9 @@ def test_the_relay_switches_where_it_is_said_to(gain):
     for k, (_, state, _, sentence) in enumerate(rows[:-1]):
         if state is not State.RELAY or rows[k + 1][1] is not State.RELAY:
             continue
-        level, _ = numbers("at # for # s", sentence)
+        level, _ = numbers("at # u for # s", sentence)
         assert level == pytest.approx(record.command[k], abs=1e-5)
-        (target,) = numbers("is to (?:rise|fall) to #", sentence)
+        (target,) = numbers("is to (?:rise|fall) to # y", sentence)
         beyond = rows[k + 1][2] - target if "rise" in sentence else target - rows[k + 1][2]
         if abs(beyond) > 1e-3:
             assert (record.command[k + 1] != record.command[k]) == (beyond > 0.0)
@@ -67,10 +67,10 @@ def test_the_step_is_told_with_its_level_and_the_band_that_must_be_left():
     began = waiting[0][0]
     for t, _, y, sentence in waiting:
         since, measurement, rest, band = numbers(
-            "no response after # s: the measurement # is to leave # -/\\+ #", sentence
+            "no response after # s: the measurement # y is to leave # -/\\+ # y", sentence
         )
         assert since == pytest.approx(t - began, abs=0.051)
-        assert sentence.startswith("stepped to 3.3, ")
+        assert sentence.startswith("stepped to 3.3 u, ")
         assert measurement == pytest.approx(y, abs=1e-3)
         assert rest == pytest.approx(REST, abs=NOISE)
         assert band == pytest.approx(3.0 * NOISE, rel=0.4)
