@@ -487,7 +487,7 @@ class Verifier:
             return self._waits_for or "computing what the step will do"
         now = (
             f"{duration(trial.lasted)} of {duration(trial.plan.duration)}: the measurement is "
-            f"{self._recent[-1][1]:.6g}"
+            f"{self._recent[-1][1]:.6g} y"
         )
         if trial.made:
             return f"back without the step, {now}"

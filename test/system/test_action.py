@@ -86,7 +86,7 @@ def test_an_action_gives_feedback_model_gains_and_bag(rig: Rig) -> None:
     assert set(range(1, len(record.cycle_start))) <= set(counts)
     told = " | ".join(f.status for f in goal.feedback)
     assert "is to rise to " in told
-    for words in ("stepped to 1.1625, ", "computing the model, "):
+    for words in ("stepped to 1.1625 u, ", "computing the model, "):
         assert words in told
         assert words in relay.log
     models = [f.transfer_function.experiment_id for f in goal.feedback]

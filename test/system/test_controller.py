@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shutil
 import signal
 import subprocess
@@ -123,6 +124,7 @@ def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -
     for part in ("0.3000", digits(gains[-1].kc), digits(gains[-1].ti)):
         assert part in shown
     assert "step 1 of 2, set-point +0.2 y, " in said
+    assert re.search(r"the measurement is \S+ y\b", said)
     assert "step 2 of 2, load +0.1 u, " in controller.log
     assert parameters_of(rig) == [gains[-1].kc, gains[-1].ti]
     full = rig.listen("verification", Verification)
