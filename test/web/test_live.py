@@ -276,6 +276,11 @@ def test_long_numbers_of_a_figure_do_not_run_into_the_title_of_its_axis(tmp_path
         title = "[...document.querySelectorAll('#plot-live-measurement .axis')].at(-1)"
         assert max(len(text) for text, _ in ticks) >= 6
         assert tab.eval(f"(each => {box}.right)({title})") < min(at for _, at in ticks)
+        # the axis of time has its name while there is no command, whose figure has it below
+        assert "time [s]" in tab.text("#plot-live-measurement")
+        live.sample("command", 2.0)
+        tab.wait("document.querySelector('#plot-live-command').checkVisibility()")
+        assert "time [s]" not in tab.text("#plot-live-measurement")
 
 
 @pytest.mark.browser

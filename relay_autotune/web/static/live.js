@@ -259,14 +259,15 @@ export class Live {
     const said = (signal, unit) => `now ${signal.count ? signal.now.toPrecision(4) : "none"} ${unit}`;
     const ys = reach(within(measurement, xs), limits, lines.map((line) => line.y));
     const bounds = limits.filter((y) => ys && y >= ys[0] && y <= ys[1]);
+    // The figure of the command, with the axis of time, is not there before the first command.
+    const alone = $("plot-live-command").hidden = !command.count && !levels.length;
+    this.plots.measurement.words.x = alone ? "time [s]" : "";
     this.plots.measurement.draw({
       xs, ys, said: said(measurement, "y"),
       curves: [{ ...measurement.curve, kind: "measured", name: "measurement" }],
       lines: [...lines, ...bounds.map((y) => ({ y, kind: "bound" }))],
       names: [["bound", bounds.length ? "limits of the tune" : ""], ["setpoint", lines.length ? "set-point, with the relay's band" : ""]],
     });
-    // Before the first command there is nothing to see.
-    $("plot-live-command").hidden = !command.count && !levels.length;
     this.plots.command.draw({
       xs, ys: reach(within(command, xs), [], held === null ? levels : [...levels, held]), said: said(command, "u"),
       curves: [{ ...command.curve, kind: "input", name: "command" }],
