@@ -65,6 +65,8 @@ def test_kinds_rules_and_weight_by_mouse(browser, url, subject):
     value, unit = tab.text("#noise-value").split()
     known = subject.shaping.task.options
     assert (float(value), unit) == (pytest.approx(known.noise_share * known.amplitude, 0.06), "u")
+    kept = tab.text("#keep")
+    assert "Gains for controller_node" in kept and "Gains as yaml" in kept
     tab.click("input[value=pi]")
     expected = told(subject, DesignRequest(controller="pi"))
     tab.until(lambda: shown(tab).startswith(expected), expected)

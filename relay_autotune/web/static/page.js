@@ -239,7 +239,7 @@ function showKeep(exports) {
     button.addEventListener("click", work);
   };
   keep("Report as one file", () => download("report.html", {}));
-  for (const name of exports) keep(`Gains for ${name}`, () => exportGains(name));
+  for (const name of exports) keep(exported(name), () => exportGains(name));
 }
 
 function showRefused(text) {
@@ -314,9 +314,12 @@ function choose(k) {
 }
 const trades = [];
 
+// A law is that of a program; the others are forms of a file.
+function exported(name) { return `Gains ${laws.includes(name) ? "for" : "as"} ${name}`; }
+
 function exportGains(name) {
   if (!(shaped && shaped.doubtful)) { download(`gains/${name}`, {}); return; }
-  plan.begin(`Gains for ${name}`, "Write them all the same", () => download(`gains/${name}`, { accept_doubtful: "yes" }));
+  plan.begin(exported(name), "Write them all the same", () => download(`gains/${name}`, { accept_doubtful: "yes" }));
   plan.say("The file will say that they are doubtful.", [["note", "doubtful", shaped.doubtful]], true);
 }
 
