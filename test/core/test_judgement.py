@@ -377,7 +377,7 @@ def test_a_loop_slower_than_what_the_record_shows_is_doubtful(record, gains, sho
     fitted = np.where(record.time > begin + shown, math.nan, found.fitted)
     beyond = finding("beyond", record, replace(found, fitted=fitted), gains)
     last = record.time[record.time <= begin + shown][-1] - begin
-    s = 1j / last
+    s = 1j * math.pi / last
     assert beyond.value == pytest.approx(1.0 / abs(found.model(s) * gains(s)), rel=1e-6)
     assert beyond.result is result
 

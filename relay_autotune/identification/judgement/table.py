@@ -103,7 +103,7 @@ def _beyond(evidence: Evidence) -> Measured | None:
     loop, shown = evidence.loop, evidence.shown
     if loop is None or not shown > 0.0:
         return None
-    s = np.array([1j / shown])
+    s = np.array([1j * math.pi / shown])
     gain = float(abs(evidence.found.model(s) * loop.controller(s))[0])
     return Measured(1.0 / gain) if gain > 0.0 else None
 
@@ -263,14 +263,14 @@ LOOP_CHECKS = (
     Check(
         name="beyond",
         title="Beyond",
-        what="1 over the loop's gain at the frequency of which the record shows one radian, from "
-        "the first change of the command to the last sample that was fitted",
+        what="1 over the loop's gain at the frequency of which the record shows half a period, "
+        "from the first change of the command to the last sample that was fitted",
         unit="",
         doubtful=1.0,
         # Feedback of a tenth changes nothing that the record shows by more than a tenth.
         failed=10.0,
-        sentence="at the lowest frequency that the record shows the loop's gain is 1/{value}: how "
-        "slowly it settles was not seen",
+        sentence="the record is short for so slow a loop, whose gain is 1/{value} at the lowest "
+        "frequency of which it shows half a period",
         remedy="record for longer after the first change of the command",
         measure=_beyond,
     ),
