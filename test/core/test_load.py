@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""A load that comes early in a test, where too few cycles follow to leave it out."""
+"""A load that comes in a record: early in a test, or while a controller works."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.record.record import PiecewiseConstant
+from relay_autotune.record.record import PiecewiseConstant, Record
 
 FIRST_ORDER = structure_named("fopdt").of_fields(gain=1.65, time_constants=[20.0], dead_time=10.0)
 SECOND_ORDER = structure_named("sopdt").of_fields(
@@ -95,3 +95,35 @@ def test_all_draws_are_had_beside_a_load_and_a_zero_that_a_dead_time_cancels(noi
     found = identify(record, "waveform", Known(structure="sopdt_zero"))
     # By the slopes of the model alone 35 and 1 were had.
     assert len(found.draws) >= 90
+
+
+def controlled(load):
+    """Record a step of the set-point, and later one of the load, under a PI controller."""
+    samples, interval, parts = 800, 2.0, 8
+    rng, step = np.random.default_rng(2), interval / parts
+    lags, late = (120.0, 25.0, 8.0), round(6.0 / step)
+    states, commands, integral = [0.0, 0.0, 0.0], [0.0] * (late + 1), 0.0
+    y, u = np.zeros(samples), np.zeros(samples)
+    for k in range(samples):
+        y[k] = states[-1] + rng.normal(0.0, 0.1)
+        error = (20.0 if k >= 100 else 0.0) - y[k]
+        integral += error * interval / 80.0
+        u[k] = error + integral
+        for _ in range(parts):
+            commands.append(float(u[k]))
+            into = 3.0 * (commands[-1 - late] + (load if k >= 450 else 0.0))
+            for i, lag in enumerate(lags):
+                states[i] += step * (into - states[i]) / lag
+                into = states[i]
+    return Record(interval * np.arange(samples), y, u)
+
+
+@pytest.mark.parametrize("load", [-5.0, 0.0])
+def test_a_load_under_a_controller_does_not_change_the_model(load):
+    """It was taken for a slow disturbance, and the gain for two thirds of what it is."""
+    found = identify(controlled(load), "waveform")
+    assert found.loaded is (load != 0.0)
+    assert found.model.gain == pytest.approx(3.0, rel=0.02)
+    assert sum(t.real for t in found.model.time_constants) + found.model.dead_time == (
+        pytest.approx(159.0, rel=0.05)
+    )

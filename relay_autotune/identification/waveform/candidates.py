@@ -141,12 +141,14 @@ class FitContext:
     :param sign: the direction in which the relay worked, 1 or -1, which a model must share; 0:
         not known.
     :param held: True: a relay held the process, so that it may integrate or grow.
+    :param loads: True: a step of the load may be estimated.
     """
 
     problem: Problem
     fopdt: Trial
     sign: int
     held: bool
+    loads: bool
     _fopdts: dict[tuple[float | None, ...], Trial] = field(default_factory=dict, repr=False)
 
     @classmethod
@@ -158,7 +160,7 @@ class FitContext:
         :param held: True: a relay held the process.
         """
         fopdt = best_of(problem, start_fopdt(problem, sign))
-        return cls(problem, fopdt, sign, held)
+        return cls(problem, fopdt, sign, held, loads=held)
 
     @cached_property
     def guess(self) -> Guess:
@@ -268,7 +270,9 @@ class FitContext:
 
     def _score(self, problem: Problem, state: Trial, model: TransferFunction) -> float:
         n = problem.time.size
-        score = information_criterion(state.cost, n, state.parameters, self.floor)
+        # The instant of a load is estimated, too.
+        count = state.parameters + (problem.load is not None)
+        score = information_criterion(state.cost, n, count, self.floor)
         score += colour_cost(problem.colour, n)
         imitations = sum(nuisances_of(problem))
         if not self.held:
@@ -353,8 +357,7 @@ class FitContext:
             "past": not rested and self.problem.past_is_open,
             "unequal": self.problem.acts_both_ways,
             "play": self.problem.most_play >= self.least_friction,
-            # Between a few steps, a load cannot be told from a slow disturbance.
-            "load": self.held and len(self.problem.bounds) == 1,
+            "load": self.loads and len(self.problem.bounds) == 1,
             "friction": self.held and bool(self.problem.motions),
         }
         alone: list[tuple[str, ...]] = [(term,) for term in TERMS if needed[term]]

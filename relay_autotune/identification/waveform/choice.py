@@ -36,6 +36,7 @@ from relay_autotune.identification.waveform.residuals import (
     Colour,
     colour_cost,
     colour_of,
+    ljung_box,
     slow_colour,
 )
 from relay_autotune.identification.waveform.separable import (
@@ -86,6 +87,8 @@ _MOST_WHITE = 16_384
 _MOST_TIMES = 4
 # Turns between a colour and what it leaves, and the gain in the score that ends them.
 _MOST_TURNS, _LITTLE = 20, 0.5
+# Probability of white noise as correlated as a residual, from which that counts as white.
+_CHANCE = 1e-3
 # Score beyond which a structure is hopeless beside the best one: odds of e^15. The plain ones
 # never are: gains have to hold on their models, too.
 _HOPELESS = 30.0
@@ -125,6 +128,8 @@ def chosen_fit(
     """
     few = _dense_enough(problem, sign, held)
     found = _compared(few, known, among)
+    if not held and found and found[0].problem.colour is not None:
+        found = _with_a_load(found, _compared(replace(few, loads=True), known, among))
     dense = problem.thinned(_MOST_WHITE)
     if found and dense.time.size > few.problem.time.size:
         found = _on_more_samples(replace(few, problem=dense), found)
@@ -145,6 +150,22 @@ def chosen_fit(
         raise no_response(known)
     # Before a jump or without spikes the best simulation may: it shows these.
     return next((f for f in fits if outweighs_disturbance(f.problem, f.state)), fits[-1])
+
+
+def _with_a_load(found: list[Candidate], loaded: list[Candidate]) -> list[Candidate]:
+    """Return candidates with a step of the load, where white noise is all that they leave.
+
+    Between a few steps, a slow disturbance looks like a load as well.
+
+    :param found: without a load, in a colour, the best first.
+    :param loaded: with a load where that is likelier.
+    """
+    if not loaded or loaded[0].problem.colour is not None or loaded[0].score >= found[0].score:
+        return found
+    best = loaded[0]
+    columns, _ = best.problem.columns(best.state.theta)
+    p = ljung_box(best.problem.y - best.state.coefficients @ columns)
+    return loaded if p >= _CHANCE else found
 
 
 def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candidate]:
