@@ -290,6 +290,9 @@ def _compared(context: FitContext, known: Known, among: Sequence[str] = TRIED) -
     reached: list[_Reached] = []
     tried: set[tuple[bool, ...]] = set()
     decided = _with_best_terms(context, simple)
+    if context.loads and not context.held:
+        # All without a load were compared before.
+        decided = [c for c in decided if c.problem.load is not None]
     while decided:
         white = (context.refit(c, None) for c in decided)
         ready = [*simple, *(c for c in white if c is not None)]
