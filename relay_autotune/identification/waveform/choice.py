@@ -29,7 +29,7 @@ from relay_autotune.identification.waveform.candidates import (
     drop_first_dead_time,
     nuisances_of,
 )
-from relay_autotune.identification.waveform.fit_covariance import Fit
+from relay_autotune.identification.waveform.fit_covariance import Fit, raw_residual
 from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import (
@@ -128,8 +128,6 @@ def chosen_fit(
     """
     few = _dense_enough(problem, sign, held)
     found = _compared(few, known, among)
-    if not held and found and found[0].problem.colour is not None:
-        found = _with_a_load(found, _compared(replace(few, loads=True), known, among))
     dense = problem.thinned(_MOST_WHITE)
     if found and dense.time.size > few.problem.time.size:
         found = _on_more_samples(replace(few, problem=dense), found)
@@ -150,22 +148,6 @@ def chosen_fit(
         raise no_response(known)
     # Before a jump or without spikes the best simulation may: it shows these.
     return next((f for f in fits if outweighs_disturbance(f.problem, f.state)), fits[-1])
-
-
-def _with_a_load(found: list[Candidate], loaded: list[Candidate]) -> list[Candidate]:
-    """Return candidates with a step of the load, where white noise is all that they leave.
-
-    Between a few steps, a slow disturbance looks like a load as well.
-
-    :param found: without a load, in a colour, the best first.
-    :param loaded: with a load where that is likelier.
-    """
-    if not loaded or loaded[0].problem.colour is not None or loaded[0].score >= found[0].score:
-        return found
-    best = loaded[0]
-    columns, _ = best.problem.columns(best.state.theta)
-    p = ljung_box(best.problem.y - best.state.coefficients @ columns)
-    return loaded if p >= _CHANCE else found
 
 
 def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candidate]:
@@ -275,17 +257,36 @@ def _dense_enough(problem: Problem, sign: int, held: bool) -> FitContext:
 def _compared(context: FitContext, known: Known, among: Sequence[str] = TRIED) -> list[Candidate]:
     """Return all structures in one colour, the best first.
 
-    What is estimated beside the model is decided with a few simple structures, and again with
-    the best one of all.
+    Where no relay held the process, a step of the load counts only if white noise is all that is
+    left: between a few steps, a slow disturbance looks like a load as well.
     """
     # What runs away by itself is not recorded, except where a relay held it.
     names = [n for n in among if context.held or not TABLE[n].unstable]
+    first = [*SIMPLE, *[INTEGRATOR_LAG.name] * bool(context.problem.motions)]
     if known.structure:
-        names = [known.structure]
-    first = (*SIMPLE, INTEGRATOR_LAG.name) if context.problem.motions else SIMPLE
-    simple = context.fit(names if known.structure else first, known.order)
-    if not simple:
-        return []
+        names = first = [known.structure]
+    simple = context.fit(first, known.order)
+    found = _with_terms(context, known, names, simple)
+    if context.loads or not found or found[0].problem.colour is None:
+        return found
+    loaded = _with_terms(replace(context, loads=True), known, names, simple)
+    if not loaded or loaded[0].problem.colour is not None or loaded[0].score >= found[0].score:
+        return found
+    return loaded if ljung_box(loaded[0].state.residual) >= _CHANCE else found
+
+
+def _with_terms(
+    context: FitContext, known: Known, names: Sequence[str], simple: list[Candidate]
+) -> list[Candidate]:
+    """Return structures with the terms beside the model that a record needs, the best first.
+
+    The terms are decided with a few simple structures, and again with the best one of all.
+
+    :param context: the samples, and the terms that may be estimated.
+    :param known: the structure, if it is known.
+    :param names: of the structures.
+    :param simple: some of them in white noise, without such terms.
+    """
     found: list[Candidate] = []
     reached: list[_Reached] = []
     tried: set[tuple[bool, ...]] = set()
@@ -428,8 +429,7 @@ def _in(colour: Colour | None, found: list[Candidate], context: FitContext) -> l
 
 def _colour(problem: Problem, state: Trial) -> Colour | None:
     """Return the colour of a fit's weighted residual; None: it is white."""
-    columns, _ = problem.columns(state.theta)
-    left = problem.y - state.coefficients @ columns
+    left = raw_residual(problem, state)
     if problem.weight is not None:
         left = left * problem.weight
     return colour_of([left[part] for part in problem.experiments])
