@@ -154,8 +154,7 @@ class RelayNode(ServedNode):
         self._relay(command)
         session.answered()
         self._loop.commanded = command
-        if session.has_news:
-            self._defer_news(session)
+        self._defer_news(session)
         if session.experiment.finished:
             self._leave(session, command)
 
@@ -241,14 +240,15 @@ class RelayNode(ServedNode):
     # While a tune runs.
 
     def _defer_news(self, session: Session) -> None:
-        for index in range(session.published_cycles, session.experiment.cycle_count):
-            self.defer(partial(self._publish_cycle, session, index))
-        session.published_cycles = session.experiment.cycle_count
-        if session.experiment.state is not session.published_state:
-            session.published_state = session.experiment.state
+        experiment, early = session.experiment, session.early
+        while session.published_cycles < experiment.cycle_count:
+            self.defer(partial(self._publish_cycle, session, session.published_cycles))
+            session.published_cycles += 1
+        if experiment.state is not session.published_state:
+            session.published_state = experiment.state
             self.defer(self._narrator.now)
-        if (early := session.early) is not None and early.is_due(session.experiment):
-            early.look(session.experiment)
+        if early is not None and early.is_due(experiment):
+            early.look(experiment)
             self.defer(lambda: self._ends.progress.publish(session.message()))
 
     def _publish_cycle(self, session: Session, index: int) -> None:

@@ -88,16 +88,6 @@ class Session:
         self._sent_ns = array.array("q")
         self.clocks = ClockWatch()
 
-    @property
-    def has_news(self) -> bool:
-        """True if a cycle or a state is not told yet, or the early end must be checked."""
-        experiment = self.experiment
-        if experiment.cycle_count != self.published_cycles:
-            return True
-        if experiment.state is not self.published_state:
-            return True
-        return self.early is not None and self.early.is_due(experiment)
-
     def answer(self, measurement: float, source: int | None, received: int | None) -> float | None:
         """Take a measurement; return the command, or None for no answer.
 
