@@ -16,7 +16,7 @@ from worked_cases import PROCESSES, cases
 from relay_autotune.loop.stability import closed_loop_unstable_poles
 from relay_autotune.process.structures import IPDT, UNSTABLE_FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.ultimate import Polar, ultimate_point
+from relay_autotune.process.ultimate import ultimate_point
 
 
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), cases("thy.T1"))
@@ -139,7 +139,7 @@ def test_unstable_poles_are_counted_like_the_roots_of_a_pade_approximation(
 
 @given(
     exponent=st.floats(-140.0, 140.0),
-    ratio=st.floats(-140.0, 140.0),
+    ratio=st.floats(-12.0, 140.0),
     order=st.integers(1, 4),
     sign=st.sampled_from((-1.0, 1.0)),
 )
@@ -187,14 +187,14 @@ def test_a_dead_time_beyond_any_lag_is_no_slower():
 def test_turns_of_a_dead_time_are_looked_at_where_the_process_passes_most(monkeypatch, dead_time):
     """A noise gave a model with a million turns before its maximum, and 100 such took 90 s."""
     lead, lag, points = 10.0, 0.1, 0
-    evaluate = Polar.turns
+    evaluate = TransferFunction.phase
 
-    def counted(self, place, whole=0.0):
+    def counted(self, frequency):
         nonlocal points
-        points += np.size(place)
-        return evaluate(self, place, whole)
+        points += np.size(frequency)
+        return evaluate(self, frequency)
 
-    monkeypatch.setattr(Polar, "turns", counted)
+    monkeypatch.setattr(TransferFunction, "phase", counted)
     point = ultimate_point(
         TransferFunction(1.0, zeros=(lead,), time_constants=(lag, lag), dead_time=dead_time)
     )
