@@ -13,7 +13,9 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -148,30 +150,24 @@ def analyse(
     record, cycles = chosen.record, chosen.cycles
     found = Analysis(record, cycles, assess(models, record), 0)
     settled = bool(cycles) and limit_cycle(cycles).converged
-    return _judged(found, (record,), _Tuning(task, rules, simple, rng, tell), settled=settled)
+    return _judged(found, (record,), task, rules, simple, rng, tell, settled=settled)
 
 
-def model_so_far(record: Record, task: Task | None = None) -> Analysis:
+def model_so_far(record: Record, task: Task | None = None, *, predicts: bool = False) -> Analysis:
     """Identify the record of a running experiment by one method.
 
     This takes a fraction of the time of :func:`analyse`. There are no gains.
 
     :param record: the record so far.
-    :param task: method and what is known; None: the defaults.
+    :param task: method, rule, what is known and asked; None: the defaults.
+    :param predicts: True: the Ms of the gains is predicted.
     """
-    chosen = _chosen_so_far(record, task or Task())
-    return chosen if isinstance(chosen, Analysis) else chosen.alone
-
-
-def prediction_so_far(record: Record, task: Task) -> Analysis:
-    """Identify like :func:`model_so_far`, and predict the Ms of the gains.
-
-    :param record: the record so far.
-    :param task: method, rule, what is known and asked.
-    """
+    task = task or Task()
     chosen = _chosen_so_far(record, task)
     if isinstance(chosen, Analysis):
         return chosen
+    if not predicts:
+        return chosen.alone
     of = chosen.model, chosen.record, chosen.cycles
     designed = task_of_record(*of, task.options, chosen.simple(task))
     predicted = predicted_ms(designed, rule_named(task.rule))
@@ -199,7 +195,7 @@ class RunningFit:
             :data:`~relay_autotune.experiment.early_end.SOUGHT`.
         :param wanted: half the interval's width over the value.
         """
-        so_far = prediction_so_far if sought == MS else model_so_far
+        so_far = partial(model_so_far, predicts=sought == MS)
         chosen = self._chosen
         recent = record.duration < _CHOSEN_ANEW * self._duration
         if task.chooses and chosen is not None and recent:
@@ -239,24 +235,6 @@ class _Chosen:
         if task.rule == DEFAULT_RULE:
             return None
         return _simple((self.record,), task.known, self.model)
-
-
-@dataclass(frozen=True)
-class _Tuning:
-    """What the selected model is tuned with.
-
-    :param task: what is known and asked.
-    :param rules: names of the rules, the one of the recommended gains first.
-    :param simple: the FOPDT that most rules need; None: there is none.
-    :param rng: draws the models within the uncertainty; None: of a fixed seed.
-    :param tell: called with what begins.
-    """
-
-    task: Task
-    rules: tuple[str, ...]
-    simple: TransferFunction | None
-    rng: np.random.Generator | None = None
-    tell: Tell = _quiet
 
 
 def _chosen(record: Record, task: Task) -> _Chosen | Analysis:
@@ -340,30 +318,48 @@ def analyse_jointly(
         chosen = replace(chosen, warnings=(*chosen.warnings, told))
     found = Analysis(first, joint.cycles, assess((chosen,), first), 0)
     simple = _simple(records, known, chosen)
-    return _judged(found, records, _Tuning(task, _first(rule), simple, rng))
+    return _judged(found, records, task, _first(rule), simple, rng)
 
 
 def _judged(
-    found: Analysis, records: Sequence[Record], tuning: _Tuning, *, settled: bool = False
+    found: Analysis,
+    records: Sequence[Record],
+    asked: Task,
+    rules: Sequence[str],
+    simple: TransferFunction | None,
+    rng: np.random.Generator | None,
+    tell: Tell = _quiet,
+    *,
+    settled: bool = False,
 ) -> Analysis:
-    """Judge the model, add gains if they are allowed, and judge the gains."""
+    """Judge the model, add gains if they are allowed, and judge the gains.
+
+    :param asked: what is known and asked.
+    :param rules: names of the rules, the one of the recommended gains first.
+    :param simple: the FOPDT that most rules need; None: there is none.
+    :param rng: draws the models within the uncertainty; None: of a fixed seed.
+    :param tell: called with what begins.
+    """
     chosen, *others = found.models
     beside = difference(chosen, found.record)
     chosen = widened(chosen, beside)
     found = replace(found, models=(chosen, *others))
     evidence = Evidence(found.record, chosen, beside, settled)
-    refused = next((_refusal(r) for r in records if r.outcome in _NO_GAINS), "")
+    ended = (
+        f"{_NO_GAINS[r.outcome]}: no gains. {r.reason}" for r in records if r.outcome in _NO_GAINS
+    )
+    refused = next(ended, "").strip()
     findings = judge(MODEL_CHECKS, evidence)
     judgement = Judgement(findings, refused=refused)
     if judgement.verdict is Verdict.NONE:
         return _without_gains(found, judgement)
-    tuning.tell("designing the gains")
-    record, options = found.record, tuning.task.options
-    task = task_of_record(chosen, record, found.cycles, options, tuning.simple, tuning.rng, beside)
+    tell("designing the gains")
+    record, options = found.record, asked.options
+    task = task_of_record(chosen, record, found.cycles, options, simple, rng, beside)
     shaping = Shaping(task, evidence, findings)
     chosen = warned_of_rows(chosen, record, options)
     found = replace(found, models=(chosen, *others), shaping=shaping)
-    tuned = _tuned(found, task, tuning.rules)
+    tuned = _tuned(found, task, rules)
     gains = tuned.best_gains
     if gains is None:
         return replace(tuned, judgement=replace(judgement, refused=tuned.reason))
@@ -371,10 +367,6 @@ def _judged(
     if judgement.verdict is Verdict.NONE:
         return _without_gains(found, judgement)
     return replace(tuned, judgement=judgement)
-
-
-def _refusal(record: Record) -> str:
-    return f"{_NO_GAINS[record.outcome]}: no gains. {record.reason}".strip()
 
 
 def _without_gains(found: Analysis, judgement: Judgement) -> Analysis:
@@ -408,11 +400,9 @@ def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
         return replace(found, reason=f"no gains: {error}")
     gains = [first]
     for name in rules[1:]:
-        try:
+        # A rule that does not apply is left out: it is only for comparison.
+        with suppress(TuningError):
             gains.append(design(task, name))
-        except TuningError:
-            # Skip a rule that does not apply: it is only for comparison.
-            continue
     delay = task.options.added_delay
     return replace(found, gains=tuple(gains), recommended=0, added_delay=delay)
 
@@ -441,10 +431,8 @@ def _others(record: Record, task: Task, chosen: Identification) -> list[Identifi
         wanted = wanted[1:]
     found = []
     for name, known in wanted:
-        try:
+        with suppress(RelayAutotuneError):
             found.append(_guarded(record, name, known))
-        except RelayAutotuneError:
-            continue
     return found
 
 

@@ -30,6 +30,7 @@ from relay_autotune.errors import BagError, visible
 
 _TOKEN = re.compile(
     r"""\s+ | //[^\n]* | /\*.*?\*/                                  # nothing
+    | @\s*[\w:]+ (?:\s*\((?:[^()"'] | "(?:[^"\\]|\\.)*" | '(?:[^'\\]|\\.)*')*\))?   # an annotation
     | (?P<text>"(?:[^"\\]|\\.)*" | '(?:[^'\\]|\\.)*')
     | (?P<word>[A-Za-z_]\w*) | (?P<number>\d[\w.]*) | (?P<mark>::|[^\s\w"'])""",
     re.VERBOSE | re.DOTALL,
@@ -40,7 +41,6 @@ _NUMBERS = {
     "long long": "int64", "unsigned long long": "uint64",
     **{f"{sign}int{size}": f"{sign}int{size}" for sign in ("", "u") for size in (8, 16, 32, 64)},
 }  # fmt: skip
-_CLOSING = {"(": ")", "{": "}", "[": "]"}
 
 
 class _Parser:
@@ -94,73 +94,54 @@ class _Parser:
             raise ValueError(f"{word[:20]!r} where a name was expected")
         return word
 
-    def _pass_over(self, opening: str) -> None:
-        """Pass over everything up to the mark that closes the one here."""
-        closing, depth = _CLOSING[opening], 0
-        while True:
-            token = self._take()
-            depth += (token == opening) - (token == closing)
-            if depth == 0:
-                return
-
-    def _annotations(self) -> None:
-        while self._accept("@"):
-            self._scoped()
-            if self._peek() == "(":
-                self._pass_over("(")
-
     # --- definitions
 
     def _definition(self, scope: tuple[str, ...]) -> None:
-        self._annotations()
         what = self._word()
-        if what == "module":
-            inner = (*scope, self._word())
+        if what == "typedef":
+            for alias, kind in self._declared(scope):
+                self._named["/".join((*scope, alias))] = kind
+            return
+        if what == "const":
+            self._type(scope, 0)
+        inner = (*scope, self._word())
+        name = "/".join(inner)
+        if what == "const":
+            self._take("=")
+            value = self._take()
+            if value.isdecimal() and self._peek() == ";":
+                self._sizes[name] = _size(value)
+            while self._peek() != ";":
+                self._take()
+        elif what == "module":
             if len(inner) > DEEPEST_TYPE:
                 raise ValueError(f"modules more than {DEEPEST_TYPE} deep")
             self._take("{")
             while not self._accept("}"):
                 self._definition(inner)
         elif what == "struct":
-            self._struct(scope)
-        elif what == "typedef":
-            kind = self._type(scope, 0)
-            name = "/".join((*scope, self._word()))
-            self._named[name] = self._array(kind, scope)
+            fields: list[tuple[str, Type]] = []
+            self._take("{")
+            while not self._accept("}"):
+                fields += self._declared(scope)
+            self._found[name] = tuple(fields)
         elif what == "enum":
-            self._named["/".join((*scope, self._word()))] = number_named("uint32")
-            self._pass_over("{")
-        elif what == "const":
-            self._constant(scope)
+            self._named[name] = number_named("uint32")
+            self._take("{")
+            while self._take() != "}":
+                pass
         else:
             raise ValueError(f"{what[:60]!r} is not a definition")
         self._take(";")
 
-    def _struct(self, scope: tuple[str, ...]) -> None:
-        name = "/".join((*scope, self._word()))
-        self._take("{")
-        fields: list[tuple[str, Type]] = []
-        while True:
-            self._annotations()
-            if self._accept("}"):
-                break
-            kind, more = self._type(scope, 0), True
-            while more:
-                field = self._word()
-                fields.append((field, self._array(kind, scope)))
-                more = self._accept(",")
-            self._take(";")
-        self._found[name] = tuple(fields)
-
-    def _constant(self, scope: tuple[str, ...]) -> None:
-        self._type(scope, 0)
-        name = "/".join((*scope, self._word()))
-        self._take("=")
-        value = self._take()
-        if value.isdecimal() and self._peek() == ";":
-            self._sizes[name] = _size(value)
-        while self._peek() != ";":
-            self._take()
+    def _declared(self, scope: tuple[str, ...]) -> list[tuple[str, Type]]:
+        """Return the names that follow a type, each with its type."""
+        kind, found, more = self._type(scope, 0), list[tuple[str, Type]](), True
+        while more:
+            found.append((self._word(), self._array(kind, scope)))
+            more = self._accept(",")
+        self._take(";")
+        return found
 
     def _array(self, kind: Type, scope: tuple[str, ...]) -> Type:
         """Return the type with the sizes that follow a name."""

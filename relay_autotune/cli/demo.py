@@ -13,12 +13,14 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import Any
 
 from relay_autotune import threads  # noqa: F401  before numpy: live and replay are bit-equal
 from relay_autotune.analysis import analyse
 from relay_autotune.cli.own_nodes import OwnNodes, free_domain, ros_arguments
 from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.exchange.messages import stamp_nanoseconds
 from relay_autotune.exchange.models import document, model_fields, to_json
 from relay_autotune.process.transfer_function import TransferFunction, process_text
 from relay_autotune.quantities import NORMAL_95
@@ -27,9 +29,6 @@ from relay_autotune.report import write_page, write_picture
 from relay_autotune.report.case import Case, case_of
 from relay_autotune.result import Analysis
 from relay_autotune.text import digits
-
-if TYPE_CHECKING:
-    from relay_autotune.nodes.loop_client import LoopClient
 
 TRUTH = TransferFunction.fopdt(1.65, 20.0, 10.0)
 PERIOD = 0.1
@@ -116,6 +115,7 @@ def _run(output: Path, domain: int) -> tuple[Path, Any]:
 def _watch(nodes: OwnNodes, output: Path) -> tuple[Path, Any]:
     # ROS is looked for only when the demo runs, so that its errors are one line.
     from relay_autotune.nodes.loop_client import LoopClient
+    from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
     from relay_autotune_msgs.srv import StartTune
 
     deadline = time.monotonic() + _DEADLINE
@@ -128,7 +128,12 @@ def _watch(nodes: OwnNodes, output: Path) -> tuple[Path, Any]:
                     f"the tune took longer than {_DEADLINE:g} s; the logs are in {output}"
                 )
 
-        seen = _Seen(client)
+        seen = SimpleNamespace(
+            cycles=client.hearing(RelayCycle, "relay_cycle"),
+            experiments=client.hearing(RelayExperiment, "relay_experiment"),
+            models=client.hearing(TransferFunction, "transfer_function"),
+            gains=client.hearing(PidGains, "pi_gains"),
+        )
         start = f"{client.name}/start_tune"
         while not (answer := client.call(StartTune, start, StartTune.Request())).accepted:
             # The nodes may not have discovered each other yet.
@@ -142,22 +147,7 @@ def _watch(nodes: OwnNodes, output: Path) -> tuple[Path, Any]:
         return output / "records" / answer.experiment_id, seen.gains[-1]
 
 
-class _Seen:
-    """What a tune publishes.
-
-    :param client: of the relay_node.
-    """
-
-    def __init__(self, client: LoopClient) -> None:
-        from relay_autotune_msgs.msg import PidGains, RelayCycle, RelayExperiment, TransferFunction
-
-        self.cycles: list[Any] = client.hearing(RelayCycle, "relay_cycle")
-        self.experiments: list[Any] = client.hearing(RelayExperiment, "relay_experiment")
-        self.models: list[Any] = client.hearing(TransferFunction, "transfer_function")
-        self.gains: list[Any] = client.hearing(PidGains, "pi_gains")
-
-
-def _show_cycles(seen: _Seen, wait: Callable[[Callable[[], object]], None]) -> None:
+def _show_cycles(seen: Any, wait: Callable[[Callable[[], object]], None]) -> None:
     print("  cycle   period s   high s   low s   peaks y           K_u so far")
     shown: list[Any] = []
     while not seen.experiments or len(shown) < len(seen.cycles):
@@ -179,18 +169,14 @@ def _show_cycles(seen: _Seen, wait: Callable[[Callable[[], object]], None]) -> N
     print(f"  {end.reason}")
 
 
-def _is_fitted(seen: _Seen, cycle: Any) -> bool:
+def _is_fitted(seen: Any, cycle: Any) -> bool:
     """Tell whether a model knows a cycle, or the next cycle or the end has come."""
-    end = _seconds(cycle.header.stamp) + cycle.time[-1]
+    known = stamp_nanoseconds(cycle.header.stamp) + 1e9 * (cycle.time[-1] - PERIOD)
     return (
         bool(seen.experiments)
         or seen.cycles[-1].index > cycle.index
-        or any(_seconds(m.header.stamp) >= end - PERIOD for m in seen.models)
+        or any(stamp_nanoseconds(m.header.stamp) >= known for m in seen.models)
     )
-
-
-def _seconds(stamp: Any) -> float:
-    return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
 def _finish(output: Path, live: Any) -> int:

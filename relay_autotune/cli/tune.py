@@ -53,7 +53,6 @@ from relay_autotune.process.structures import (
     structure_named,
 )
 from relay_autotune.process.transfer_function import TransferFunction, process_text
-from relay_autotune.record.record import Outcome
 from relay_autotune.result import Shaping
 from relay_autotune.text import digits
 from relay_autotune.tuning import DEFAULT_RULE, RULES, design, task_of_model
@@ -344,7 +343,7 @@ class _Designs:
         found: dict[str, Any] = {
             "model": model_fields(model),
             "gains": [self._fields(each, every=every) for each in self.gains],
-            "recommended": self.recommended if every else 0,
+            "recommended": self.recommended,
             "refused": self.refused,
         }
         if inside:
@@ -365,11 +364,6 @@ class _Designs:
 
         return Case(
             source=process_text(self.task.model),
-            experiment_id="",
-            start=0.0,
-            duration=0.0,
-            outcome=Outcome.UNKNOWN,
-            reason="",
             models=(given_model(self.task.model),),
             selected=0,
             gains=tuple(self.gains),

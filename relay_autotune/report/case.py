@@ -94,11 +94,11 @@ class Case:
     """
 
     source: str
-    experiment_id: str
-    start: float
-    duration: float
-    outcome: Outcome
-    reason: str
+    experiment_id: str = ""
+    start: float = 0.0
+    duration: float = 0.0
+    outcome: Outcome = Outcome.UNKNOWN
+    reason: str = ""
     models: tuple[Identification, ...] = ()
     selected: int | None = None
     gains: tuple[Gains, ...] = ()
@@ -160,7 +160,9 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
     :param source: name of the recording.
     :param truth: the true process, if it was simulated.
     """
-    record = analysis.record
+    record, shaping = analysis.record, analysis.shaping
+    # Those of the design, if there was one.
+    models = around(analysis.model) if shaping is None else shaping.task.models
     return Case(
         source=source,
         experiment_id=record.experiment_id,
@@ -179,18 +181,11 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
         record=record,
         settings=settings_of(record),
         cycles=analysis.cycles or _cycles(record),
-        models_around=_judged_on(analysis),
+        models_around=models,
         added_delay=analysis.added_delay,
         judgement=analysis.judgement,
         units=record.units,
     )
-
-
-def _judged_on(analysis: Analysis) -> tuple[TransferFunction, ...]:
-    """Return the models around the selected one, those of the design if there was one."""
-    if analysis.shaping is None:
-        return around(analysis.model)
-    return analysis.shaping.task.models
 
 
 def _cycles(record: Record) -> tuple[Cycle, ...]:
@@ -354,7 +349,7 @@ def unreadable(source: str, error: str) -> Case:
     :param source: its name.
     :param error: why, a sentence.
     """
-    return Case(source, "", 0.0, 0.0, Outcome.UNKNOWN, f"The recording was not read: {error}")
+    return Case(source, reason=f"The recording was not read: {error}")
 
 
 def _case(e: dict[str, Any], source: str, truth: TransferFunction | None) -> Case:

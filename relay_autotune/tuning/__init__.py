@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from relay_autotune.errors import ModelError, TuningError, look_up
@@ -87,11 +88,9 @@ def task_of_model(model: TransferFunction, options: DesignOptions | None = None)
     """
     simple = None
     if not FOPDT.holds(model):
-        try:
+        # Without one, rules for FOPDT will say that the model is not one.
+        with suppress(TuningError):
             simple = two_point_fopdt(model)
-        except TuningError:
-            # Rules for FOPDT will then say that the model is not one.
-            simple = None
     return DesignTask(
         model=model,
         options=options or DesignOptions(),
@@ -137,15 +136,11 @@ def designed(task: DesignTask, rule: str) -> Designed:
     :raises TuningError: if the rule does not apply.
     """
     controller, reason = rule_named(rule)(task)
-    if task.options.law in ("", OWN_LAW):
-        return Designed(rule, controller, reason)
-    if rule != DEFAULT_RULE:
+    own = None
+    if task.options.law not in ("", OWN_LAW):
         # No other rule looks at the law.
-        return Designed(rule, controller, reason, controller)
-    try:
-        own, _ = robust(_with_own_law(task))
-    except TuningError:
-        return Designed(rule, controller, reason)
+        with suppress(TuningError):
+            own = robust(_with_own_law(task))[0] if rule == DEFAULT_RULE else controller
     return Designed(rule, controller, reason, own)
 
 
@@ -173,7 +168,10 @@ def judged(task: DesignTask, found: Designed) -> Gains:
     bare, warnings = None, cautions(performance, task)
     if options.law:
         reason += f"; for {options.law} every {options.sample_period:g} s"
-        own = None if found.own is None else _on_own_law(task, weighted(found.own))
+        own = None
+        if found.own is not None:
+            with suppress(TuningError):
+                own = _with_own_law(task).loop(weighted(found.own)).performance()
         warnings += cost_of(law, performance, own)
     else:
         bare, unstable = _bare(controller, task)
@@ -216,11 +214,3 @@ def _bare(controller: Controller, task: DesignTask) -> tuple[Performance | None,
     except (ModelError, TuningError):
         told = f"the loop needs the filter, tf = {controller.tf:.4g} s: without it, it is unstable"
         return None, (told,) if controller.tf > 0.0 else ()
-
-
-def _on_own_law(task: DesignTask, controller: Controller) -> Performance | None:
-    """Return what a controller attains with our own law at the same period; None: nothing."""
-    try:
-        return _with_own_law(task).loop(controller).performance()
-    except TuningError:
-        return None
