@@ -37,7 +37,7 @@ from scipy.optimize import fsolve
 from relay_autotune.analysis import analyse
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.loop.gains import ControlLaw
+from relay_autotune.loop.analysis import ControlLaw
 from relay_autotune.process.virtual_process import Actuator
 from relay_autotune.record.record import Outcome
 from relay_autotune.verdict import Verdict

@@ -24,8 +24,8 @@ from relay_autotune import threads  # noqa: F401  before numpy
 from markdown import table, three
 
 from relay_autotune.errors import TuningError
-from relay_autotune.loop.analysis import analyse_loop, is_stable
-from relay_autotune.loop.gains import ControlLaw, Controller, Performance, SeriesForm
+from relay_autotune.loop.analysis import ControlLaw, analyse_loop, is_stable
+from relay_autotune.loop.gains import Controller, Performance, SeriesForm
 from relay_autotune.process.structures import INTEGRATOR_INVERSE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.tuning import RULES, design

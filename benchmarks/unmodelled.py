@@ -34,7 +34,7 @@ from relay_autotune.analysis import analyse
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.parameters import ExperimentParameters
-from relay_autotune.loop.gains import ControlLaw
+from relay_autotune.loop.analysis import ControlLaw
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.virtual_process import Actuator, VirtualProcess

@@ -61,6 +61,19 @@ def counted(count: int, thing: str) -> str:
     return f"{count} {thing}{'' if count == 1 else 's'}"
 
 
+def span_text(seconds: float, samples: int, lost: int) -> str:
+    """Return how long was recorded, such as "30.00 s, 300 samples, 2 lost".
+
+    :param seconds: the duration [s].
+    :param samples: how many; 0: not known.
+    :param lost: how many more were sent.
+    """
+    told = f"{digits(seconds)} s"
+    if samples:
+        told += f", {counted(samples, 'sample')}" + f", {lost} lost" * bool(lost)
+    return told
+
+
 def duration(seconds: float) -> str:
     """Return a duration as text, such as "12 min 5 s"; a dash if it is not finite.
 

@@ -26,7 +26,15 @@ from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.record import Outcome, Record
-from relay_autotune.text import counted, date_text, digits, in_units, percent, plus_minus
+from relay_autotune.text import (
+    counted,
+    date_text,
+    digits,
+    in_units,
+    percent,
+    plus_minus,
+    span_text,
+)
 from relay_autotune.verdict import Judgement, Result, Verdict
 
 if TYPE_CHECKING:
@@ -258,15 +266,11 @@ def _verdict(judgement: Judgement) -> list[_Entry]:
 
 def _outcome(record: Record) -> str:
     name = f"  ({record.experiment_id})" if record.experiment_id else ""
-    if record.outcome == Outcome.UNKNOWN:
-        return f"recorded elsewhere{name}"
-    return record.outcome.name.lower() + name
+    return record.outcome.words + name
 
 
 def _span(record: Record) -> str:
-    text = f"{digits(record.duration)} s, {counted(len(record), 'sample')}"
-    if record.lost_samples:
-        text += f", {record.lost_samples} lost"
+    text = span_text(record.duration, len(record), record.lost_samples)
     if record.start:
         text += f", from {date_text(record.start)}"
     return text

@@ -11,7 +11,7 @@ and gains that do not go with that frequency, are refused.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -79,9 +79,7 @@ class ExperimentFacts:
             answer, whole = complex(swing / moved), False
         if not (frequency > 0.0 and 0.0 < abs(answer) < math.inf):
             return found
-        return cls(
-            record.experiment_id, record.outcome, record.duration, frequency, answer, whole, sign
-        )
+        return replace(found, frequency=frequency, answer=answer, whole=whole)
 
     @property
     def period(self) -> float:

@@ -66,16 +66,7 @@ class Special:
     of_message: Callable[[Any, type[RelayAutotuneError], str], Any] | None = None
 
 
-_SPECIAL: dict[type, Special] = {}
-
-
-def register(kind: type, special: Special) -> None:
-    """Register how a class is written and read.
-
-    :param kind: the class.
-    :param special: the functions that do it.
-    """
-    _SPECIAL[kind] = special
+SPECIAL: dict[type, Special] = {}
 
 
 # Documents.
@@ -86,7 +77,7 @@ def to_document(value: object) -> dict[str, Any]:
 
     :param value: an instance of a class that declares its fields.
     """
-    special = _SPECIAL.get(type(value))
+    special = SPECIAL.get(type(value))
     if special is not None:
         return dict(special.to_document(value))
     found: dict[str, Any] = {}
@@ -99,7 +90,7 @@ def to_document(value: object) -> dict[str, Any]:
         part, many = _part_of(each.kind)
         if part is not None and many:
             found[name] = [to_document(item) for item in held]
-        elif part is not None and part in _SPECIAL:
+        elif part is not None and part in SPECIAL:
             found |= to_document(held)
         elif part is not None:
             found[name] = None if held is None else to_document(held)
@@ -129,7 +120,7 @@ def of_document(kind: Any, document: Any, **given: Any) -> Any:
     :param given: fields that are known otherwise.
     :raises LookupError, TypeError, ValueError, AttributeError: if it tells no such result.
     """
-    special = _SPECIAL.get(kind)
+    special = SPECIAL.get(kind)
     if special is not None:
         return special.of_document(document)
     found = dict(given)
@@ -139,7 +130,7 @@ def of_document(kind: Any, document: Any, **given: Any) -> Any:
             continue
         name = each.document or each.name
         part, many = _part_of(each.kind)
-        if part is not None and not many and part in _SPECIAL:
+        if part is not None and not many and part in SPECIAL:
             found[each.name] = of_document(part, document)
         elif each.kind is complex:
             found[each.name] = complex(number(document["real"]), number(document["imaginary"]))
@@ -235,7 +226,7 @@ def to_message(message: Any, value: object, prefix: str = "") -> None:
     :param value: an instance of a class that declares its fields.
     :param prefix: of the names of its fields.
     """
-    special = _SPECIAL.get(type(value))
+    special = SPECIAL.get(type(value))
     if special is not None and special.to_message is not None:
         special.to_message(message, value)
         return
@@ -285,7 +276,7 @@ def of_message(
     :raises RelayAutotuneError: of that kind, if a number is outside of its declared range, arrays
         that go together differ in length, or a derived number contradicts the others.
     """
-    special = _SPECIAL.get(kind)
+    special = SPECIAL.get(kind)
     if special is not None and special.of_message is not None:
         return special.of_message(message, error, of)
     found: dict[str, Any] = {}

@@ -17,6 +17,7 @@ import numpy as np
 
 from relay_autotune.errors import MissingPackageError, ModelError, RelayAutotuneError
 from relay_autotune.exchange.fields import (
+    SPECIAL,
     Special,
     float64_array,
     json_number,
@@ -24,7 +25,6 @@ from relay_autotune.exchange.fields import (
     named,
     number,
     of_document,
-    register,
     to_document,
     word,
 )
@@ -186,18 +186,16 @@ def _estimate_of_message(message: Any, error: type[RelayAutotuneError], of: str)
     return Estimate(structure, values, covariance)
 
 
-register(
-    Estimate,
-    Special(_estimate_fields, _estimate_of_fields, _estimate_to_message, _estimate_of_message),
-)
-register(
-    Rival,
-    Special(
+SPECIAL |= {
+    Estimate: Special(
+        _estimate_fields, _estimate_of_fields, _estimate_to_message, _estimate_of_message
+    ),
+    Rival: Special(
         lambda rival: {"support": json_number(rival.support), **model_fields(rival.model)},
         lambda r: Rival(Estimate.of_model(model_of_fields(r)), number(r["support"])),
     ),
-)
-register(TransferFunction, Special(model_fields, model_of_fields))
+    TransferFunction: Special(model_fields, model_of_fields),
+}
 
 
 def to_control(system: TransferFunction | Controller, *, pade_order: int = 5) -> Any:

@@ -30,9 +30,9 @@ import numpy as np
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.errors import RelayAutotuneError, TuningError
 from relay_autotune.loop.gains import (
-    ControlLaw,
     Controller,
     Gains,
+    InternalModelLaw,
     Margins,
     Performance,
     StepFigures,
@@ -64,7 +64,10 @@ _ANGLES = 4096
 _SETTLED = 1e-3
 # A smaller final error counts as zero.
 _NO_OFFSET = 1e-3
-BAND = 0.02
+_BAND = 0.02
+
+# A linear controller: continuous, sampled, or with a model inside.
+ControlLaw = Controller | SampledLaw | InternalModelLaw
 
 
 def abscissae(duration: float | FloatArray, points: int) -> ComplexArray:
@@ -288,7 +291,7 @@ class Loop:
             iae_load=iae_load,
             iae_setpoint=iae_setpoint,
             overshoot=max(float(np.max(-error / final)), 0.0),
-            settling_time=_settling_time(setpoint.time, error, BAND * abs(final)),
+            settling_time=_settling_time(setpoint.time, error, _BAND * abs(final)),
             effort_setpoint=abs(float(command[0])) + _variation(command),
             effort_load=_variation(load.command),
         )

@@ -20,7 +20,7 @@ from __future__ import annotations
 import cmath
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 
@@ -246,31 +246,6 @@ class Gains(Performance, Controller):
     def __post_init__(self) -> None:
         Controller.__post_init__(self)
         Performance.__post_init__(self)
-
-
-class ControlLaw(Protocol):
-    """A linear controller, as :class:`~relay_autotune.loop.gains.Controller` is."""
-
-    @property
-    def period(self) -> float:
-        """Sampling period [s]; 0: continuous."""
-
-    @property
-    def i(self) -> float:
-        """Integral gain, the limit of ``s C(s)`` for s -> 0 [u/(y s)]."""
-
-    @property
-    def times(self) -> tuple[float, ...]:
-        """Times at which it changes its effect [s]."""
-
-    def __call__(self, s: ComplexArray) -> ComplexArray:
-        """Return -command per measurement at complex frequencies [u/y]."""
-
-    def from_setpoint(self, s: ComplexArray) -> ComplexArray:
-        """Return command per set-point at complex frequencies [u/y]."""
-
-    def characteristic(self, model: TransferFunction) -> tuple[TransferFunction, ...]:
-        """Return the terms L_k of the loop's characteristic equation ``1 + sum L_k(s) = 0``."""
 
 
 @dataclass(frozen=True)

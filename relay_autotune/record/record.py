@@ -95,6 +95,11 @@ class Outcome(enum.IntEnum):
     ABORTED = 2
     FAILED = 3
 
+    @property
+    def words(self) -> str:
+        """How it ended, for people."""
+        return "recorded elsewhere" if self is Outcome.UNKNOWN else self.name.lower()
+
 
 @dataclass(frozen=True)
 class RelaySettings:
@@ -407,10 +412,8 @@ class Record:
     def __repr__(self) -> str:
         """Return what the record is, on one line; its samples are in its fields."""
         name = f" of {self.experiment_id}" if self.experiment_id else ""
-        how = (
-            "recorded elsewhere" if self.outcome is Outcome.UNKNOWN else self.outcome.name.lower()
-        )
-        return f"<Record{name}: {counted(len(self), 'sample')} over {self.duration:.4g} s, {how}>"
+        length = f"{counted(len(self), 'sample')} over {self.duration:.4g} s"
+        return f"<Record{name}: {length}, {self.outcome.words}>"
 
     @property
     def duration(self) -> float:

@@ -11,20 +11,13 @@ from typing import Literal
 
 from relay_autotune.loop.analysis import as_run, difference, performance_beside
 from relay_autotune.loop.gains import Controller, Gains, Performance
-from relay_autotune.record.record import Outcome
 from relay_autotune.report.case import Case
-from relay_autotune.text import counted, date_text, digits, percent
+from relay_autotune.text import date_text, digits, percent, span_text
 from relay_autotune.verdict import Finding, Result, Verdict
 
 Tone = Literal["good", "warn", "bad"]
 
 _MARKS: dict[Tone, str] = {"good": "\N{CHECK MARK}", "warn": "!", "bad": "\N{MULTIPLICATION X}"}
-_OUTCOMES = {
-    Outcome.UNKNOWN: "recorded elsewhere",
-    Outcome.COMPLETED: "completed",
-    Outcome.ABORTED: "aborted",
-    Outcome.FAILED: "failed",
-}
 _TONES: dict[Result, Tone] = {
     Result.PASSED: "good", Result.DOUBTFUL: "warn", Result.FAILED: "bad",
 }  # fmt: skip
@@ -114,17 +107,12 @@ def facts_of(case: Case, *, with_id: bool) -> tuple[str, ...]:
     :param case: the experiment.
     :param with_id: False if the page names its id elsewhere.
     """
-    found = [_OUTCOMES[case.outcome]]
+    found = [case.outcome.words]
     if with_id and case.experiment_id:
         found.append(case.experiment_id)
     if case.start:
         found.append(date_text(case.start))
-    length = f"{digits(case.duration)} s"
-    if case.samples:
-        length += f", {counted(case.samples, 'sample')}"
-        if case.lost_samples:
-            length += f", {case.lost_samples} lost"
-    return (*found, length)
+    return (*found, span_text(case.duration, case.samples, case.lost_samples))
 
 
 def steps_of(case: Case) -> tuple[str, ...]:

@@ -14,8 +14,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.posterior import DRAWS
-from relay_autotune.loop.analysis import Loop
-from relay_autotune.loop.gains import ControlLaw
+from relay_autotune.loop.analysis import ControlLaw, Loop
 from relay_autotune.loop.stability import at_infinity, winding
 from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
