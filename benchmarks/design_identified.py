@@ -27,7 +27,8 @@ import numpy as np
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.identification.methods import identify
 from relay_autotune.loop.analysis import is_stable
-from relay_autotune.loop.stability import frequencies, peaks
+from relay_autotune.loop.stability import peaks
+from relay_autotune.process.frequencies import frequencies
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 from relay_autotune.tuning.ensemble import ensemble

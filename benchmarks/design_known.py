@@ -26,7 +26,8 @@ import numpy as np
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.loop.analysis import Loop, is_stable
 from relay_autotune.loop.gains import Controller
-from relay_autotune.loop.stability import frequencies, peaks
+from relay_autotune.loop.stability import peaks
+from relay_autotune.process.frequencies import frequencies
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.tuning import RULES

@@ -34,7 +34,8 @@ from relay_autotune.analysis import analyse
 from relay_autotune.identification.known import Known
 from relay_autotune.loop.analysis import is_stable
 from relay_autotune.loop.gains import Gains
-from relay_autotune.loop.stability import frequencies, peaks
+from relay_autotune.loop.stability import peaks
+from relay_autotune.process.frequencies import frequencies
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Outcome
 from relay_autotune.result import Analysis

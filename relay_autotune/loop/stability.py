@@ -28,7 +28,7 @@ from __future__ import annotations
 import math
 import operator
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 
 import numpy as np
@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 from relay_autotune.arrays import ComplexArray, FloatArray, IntArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Margins
+from relay_autotune.process.frequencies import PER_DECADE, frequencies
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.scalar import roots
 
@@ -95,7 +96,7 @@ def closed_loop_unstable_poles(terms: Sequence[TransferFunction]) -> float:
         if high[0] > 1.0 / _LOWEST:
             return math.inf
     ends = [
-        np.geomspace(x, y, 2 + int(_PER_DECADE * math.log10(y / x)))
+        np.geomspace(x, y, 2 + int(PER_DECADE * math.log10(y / x)))
         for x, y in ((low[0], grid[0]), (grid[-1], high[0]))
     ]
     grid = np.unique(np.concatenate((grid, *ends)))
@@ -224,63 +225,10 @@ _PEAKS = 4
 _ZOOMS, _ZOOM_POINTS = 9, 9
 # Accuracy of the logarithm of a frequency.
 _EXACT = 1e-13
-# Below this magnitude the loop has no influence.
-_RELEVANT = 0.05
-_PER_DECADE = 50
-# Distance of a sampled loop's grid from half the sampling frequency, relative to it.
-_BEFORE_END = 1e-9
 # Below this nothing is told of how a loop begins [rad/s], nor above its inverse of how it ends.
 _LOWEST = 1e-280
 # Largest step of the phase that can be followed, and largest number of divisions of a cell.
 _FOLLOWED, _MOST_DIVISIONS = 1.0, 40
-_MOST_TURNS = 800.0 * math.pi
-
-
-def frequencies(
-    *terms: TransferFunction,
-    times: Iterable[float] = (),
-    period: float = 0.0,
-    loop: Loop | None = None,
-) -> FloatArray:
-    """Return a grid with little change of the loops' magnitude and phase between points.
-
-    Loops of one process have most of their grids in common, whatever their gains.
-
-    :param terms: the loop, or the terms of its characteristic equation.
-    :param times: further times at which it changes, such as those of its controller [s].
-    :param period: of the samples: the grid ends before half their frequency [s]; 0: it ends above
-        all corners.
-    :param loop: what is followed, where that is more than the terms.
-    :return: rad/s, increasing.
-    """
-    constants = [c for t in terms for c in (*t.zeros, *t.time_constants)]
-    dead_times = sorted({t.dead_time for t in terms if t.dead_time > 0.0})
-    corners = [1.0 / abs(c) for c in (*constants, *dead_times, *times) if c != 0.0] or [1.0]
-    top = math.pi / period if period > 0.0 else 1e2 * max(corners)
-    low = math.floor(math.log10(1e-3 * min(top, *corners)))
-    high = math.ceil(math.log10(top))
-    grid = 10.0 ** (np.arange(low * _PER_DECADE, high * _PER_DECADE + 1) / _PER_DECADE)
-    grid = grid[grid <= top]
-    parts = [grid]
-    if period > 0.0:
-        parts.append(top * (1.0 - np.geomspace(1e-6, 0.5, 80)))
-    if dead_times:
-        values = np.array([loop(1j * grid)] if loop else [t(1j * grid) for t in terms])
-        relevant = grid[np.abs(values).max(axis=0) > _RELEVANT]
-        last = relevant[-1] if relevant.size else grid[0]
-    for d in dead_times:
-        # First turns of the dead time finely, later ones more coarsely.
-        parts.append(np.arange(0.05, min(12.0 * math.pi, top * d), 0.05) / d)
-        parts.append(np.arange(12.0 * math.pi, min(last * d, _MOST_TURNS), 0.2) / d)
-    for c in constants:
-        if c.imag > 0.0:
-            centre, width = 1.0 / abs(c), abs(c.real) / abs(c)
-            around = centre * (1.0 + width * np.linspace(-8.0, 8.0, 65))
-            parts.append(around[around > 0.0])
-    found = np.unique(np.concatenate(parts))
-    if period == 0.0:
-        return found
-    return np.append(found[found < top * (1.0 - 1e-7)], top * (1.0 - _BEFORE_END))
 
 
 def peaks(loop: Loop, grid: FloatArray) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -7,31 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
+from relay_autotune.process.frequencies import frequencies
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.scalar import roots
-
-_WIDTHS = np.linspace(-8.0, 8.0, 65)
-
-
-def _corners(model: TransferFunction) -> list[float]:
-    """Return logarithms of the corner frequencies, the lowest first; [0] without corners."""
-    constants = (*model.zeros, *model.time_constants, model.dead_time)
-    return sorted(-math.log(abs(c)) for c in constants if c != 0.0) or [0.0]
-
-
-def _resonances(model: TransferFunction) -> FloatArray:
-    """Return logarithms of frequencies around each resonance, within its width."""
-    found = [np.empty(0)]
-    for c in (*model.zeros, *model.time_constants):
-        if c.imag > 0.0:
-            near = 1.0 + _WIDTHS * c.real / abs(c)
-            found.append(np.log(near[near > 0.0]) - math.log(abs(c)))
-    return np.concatenate(found)
 
 
 def _size(model: TransferFunction, place: FloatArray) -> FloatArray:
@@ -170,11 +153,9 @@ def _lead(model: TransferFunction) -> float:
 
 def _crossings(model: TransferFunction) -> list[Crossing]:
     """Crossings up to the first, and later ones of at least its magnitude."""
-    corners = _corners(model)
-    low, high = corners[0] - 9.2, corners[-1] + 9.2
-    # Dense enough for everything but the dead time.
-    even = np.linspace(low, high, int(17.4 * (high - low)))
-    logarithms = np.unique(np.concatenate((even, _resonances(model))))
+    # Dense enough for everything but the turns of the dead time.
+    rational, times = replace(model, dead_time=0.0), (model.dead_time,)
+    logarithms = np.log(frequencies(rational, times=times))
     low, high = float(logarithms[0]), float(logarithms[-1])
     if model.dead_time:
         # The rational part turns the phase by at most a quarter for each root. So at this angle

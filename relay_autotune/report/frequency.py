@@ -20,6 +20,7 @@ from relay_autotune.identification.result import Identification
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.loop.sampled import ClosedLoop
+from relay_autotune.process.frequencies import frequencies
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.report.case import Case, EstimatedQuantity, in_loop, ultimate_of
@@ -128,8 +129,6 @@ def loop_frequencies(loop: TransferFunction) -> FloatArray:
 
     :param loop: controller times process.
     """
-    from relay_autotune.loop.stability import frequencies
-
     grid = frequencies(loop)
     size = np.abs(loop(1j * grid))
     shown = (size < 20.0) & (size > 0.01) & (loop.phase(grid) > _TURNS * 2.0 * math.pi)

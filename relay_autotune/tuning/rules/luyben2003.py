@@ -38,14 +38,12 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller, SeriesForm
+from relay_autotune.process.frequencies import frequencies
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.scalar import minimum_near, root
 from relay_autotune.tuning.rules.formulas import named, wants_pid
 from relay_autotune.tuning.task import DesignTask
-
-_POINTS = 800
-_BELOW, _ABOVE = 1e-5, 30.0
 
 
 def resonant_gain(loop: TransferFunction, decibels: float) -> float:
@@ -64,7 +62,7 @@ def resonant_gain(loop: TransferFunction, decibels: float) -> float:
             "so that its resonance either has no bound or stays small at every gain"
         )
     square = 10.0 ** (decibels / 10.0)
-    w = _grid(loop, limit.frequency)
+    w = frequencies(loop)
     low, high = _roots(loop, w, square)
     inside = np.flatnonzero(~np.isnan(low))
     # Neighbouring frequencies forbid one interval of gains; the highest one comes first, so that
@@ -91,16 +89,6 @@ def resonant_gain(loop: TransferFunction, decibels: float) -> float:
         return 1e3 * upper if math.isnan(value) else value
 
     return min(minimum_near(end, np.log(w), at, 1e-12)[1], upper)
-
-
-def _grid(loop: TransferFunction, limit: float) -> FloatArray:
-    corners = [1.0 / abs(c) for c in (*loop.zeros, *loop.time_constants)]
-    lowest = min([limit, *corners]) * _BELOW
-    parts = [np.geomspace(lowest, _ABOVE * limit, _POINTS)]
-    if loop.dead_time > 0.0:
-        count = min(int(_ABOVE * limit * loop.dead_time / 0.05) + 2, 50_000)
-        parts.append(np.linspace(lowest, _ABOVE * limit, count))
-    return np.unique(np.concatenate(parts))
 
 
 def _roots(loop: TransferFunction, w: FloatArray, square: float) -> tuple[FloatArray, FloatArray]:
