@@ -42,11 +42,11 @@ from relay_autotune.loop.laws import LAWS
 from relay_autotune.loop.sampled import ClosedLoop
 from relay_autotune.loop.stability import (
     closed_loop_unstable_poles,
-    frequencies,
     margins,
     peaks,
     sampled_unstable_poles,
 )
+from relay_autotune.process.frequencies import frequencies
 from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.text import digits
