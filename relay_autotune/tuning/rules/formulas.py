@@ -30,6 +30,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -172,30 +173,20 @@ def half_cycle(model: TransferFunction) -> HalfCycle | None:
     point = ultimate_point(model)
     if point is None:
         return None
-    middle = math.pi / point.frequency
-    for low, high in itertools.pairwise(_REACH):
-        for a, b in ((middle * low, middle * high), (middle / high, middle / low)):
-            found = _between(model, a, b)
-            if found is not None:
-                return found
-    return None
-
-
-def _between(model: TransferFunction, low: float, high: float) -> HalfCycle | None:
-    low = max(low, model.dead_time * (1.0 + 1e-9))
-    if not low < high:
-        return None
 
     def level(half_period: float) -> float:
         return float(HalfCycle(model, half_period)(_AT_SWITCH)[0])
 
-    try:
-        if level(low) * level(high) > 0.0:
-            return None
-        cycle = HalfCycle(model, root(level, low, high))
-    except (ModelError, np.linalg.LinAlgError):
-        return None
-    return cycle if cycle.slope(_AT_SWITCH)[0] > 0.0 else None
+    middle, least = math.pi / point.frequency, model.dead_time * (1.0 + 1e-9)
+    for near, far in itertools.pairwise(_REACH):
+        for low, high in ((middle * near, middle * far), (middle / far, middle / near)):
+            low = max(low, least)
+            with suppress(ModelError, np.linalg.LinAlgError):
+                if low < high and level(low) * level(high) <= 0.0:
+                    cycle = HalfCycle(model, root(level, low, high))
+                    if cycle.slope(_AT_SWITCH)[0] > 0.0:
+                        return cycle
+    return None
 
 
 def describing_point_of(model: TransferFunction) -> UltimatePoint | None:

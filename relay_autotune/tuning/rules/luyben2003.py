@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -262,13 +263,10 @@ def _direct(model: TransferFunction) -> TransferFunction:
 def _peak(model: TransferFunction, scale: float, ti: float) -> float:
     """Return the highest phase of the loop, after the two integrators' -180 degrees [rad]."""
 
-    def phase(w: float) -> float:
-        return float(model.phase(w)) - 0.5 * math.pi + math.atan(w * ti)
+    def lag(log_w: Any) -> Any:
+        w = np.exp(log_w)
+        return 0.5 * math.pi - model.phase(w) - np.arctan(w * ti)
 
-    grid = _GRID / scale
-    values = model.phase(grid) - 0.5 * math.pi + np.arctan(grid * ti)
-    top = int(np.argmax(values))
-    _, lowest = minimum_near(
-        lambda log_w: -phase(math.exp(log_w)), np.log(grid), top, tolerance=1e-10
-    )
-    return max(float(values[top]), -lowest)
+    log_grid = np.log(_GRID / scale)
+    top = int(np.argmin(lag(log_grid)))
+    return -min(minimum_near(lag, log_grid, top, 1e-10)[1], float(lag(log_grid[top])))
