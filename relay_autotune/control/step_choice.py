@@ -17,7 +17,7 @@ from relay_autotune.control.verification import (
     Plan,
     least_text,
     plan,
-    rounded_up,
+    rounded,
 )
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop
@@ -169,9 +169,9 @@ class StepChoice:
         low, high = setpoint - self.measurement.low, self.measurement.high - setpoint
         down, up = self._ways
         return StepRange(
-            0.0 - _rounded_down(min(down, (low - spared) / self._plan.peak)),
-            _rounded_down(min(up, (high - spared) / self._plan.peak)),
-            rounded_up(self._plan.visible * self._noise),
+            0.0 - rounded(min(down, (low - spared) / self._plan.peak), math.floor),
+            rounded(min(up, (high - spared) / self._plan.peak), math.floor),
+            rounded(self._plan.visible * self._noise),
         )
 
     def expected(self, step: float) -> str:
@@ -209,11 +209,3 @@ class StepChoice:
             )
             down, up = min(down, -ends[0]), min(up, ends[1])
         return down, up
-
-
-def _rounded_down(value: float) -> float:
-    """Return a number in two digits that is at most a value, 0 for a negative one."""
-    if not 0.0 < value < math.inf:
-        return max(value, 0.0)
-    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
-    return float(f"{math.floor(value / unit * (1.0 + 1e-9)) * unit:.2g}")

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -134,7 +135,7 @@ class Plan:
         :raises TuningError: with the least step.
         """
         height, unit = (step.setpoint, "y") if step.setpoint else (step.load, "u")
-        least = rounded_up(self.visible * noise_std)
+        least = rounded(self.visible * noise_std)
         if abs(height) < least:
             raise TuningError(f"the step is {height:g} {unit}: {least_text(least, unit)}")
 
@@ -157,12 +158,17 @@ def noise_of(noise_std: float, residual_rms: float) -> float:
     return float(np.fmax(noise_std, residual_rms))
 
 
-def rounded_up(value: float) -> float:
-    """Return a number in two digits that is at least a value, 0 for 0."""
+def rounded(value: float, whole: Callable[[float], int] = math.ceil) -> float:
+    """Return a number in two digits that is at least a value, 0 for a negative one.
+
+    :param value: the value.
+    :param whole: `math.floor`: that is at most the value.
+    """
     if not 0.0 < value < math.inf:
-        return value
+        return max(value, 0.0)
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)
-    return float(f"{math.ceil(value / unit * (1.0 - 1e-9)) * unit:.2g}")
+    # What is in two digits but for the last bits stays.
+    return float(f"{whole(round(value / unit, 7)) * unit:.2g}")
 
 
 def plan(
@@ -245,11 +251,7 @@ def _visible(
     # Samples for each instant of the prediction.
     each = max(interval / period, 1.0)
     error = (step.setpoint - deviation) / scale
-    if step.setpoint:
-        beyond = -error
-    else:
-        side = 1.0 if deviation.max() >= -deviation.min() else -1.0
-        beyond = side * error
+    beyond = _beyond(deviation, step, expected.largest)
     limit = SETTLING_RATIO * expected.settling_time + 2.0 * period
     late = (time + interval > limit) | (time >= time[-1] - interval)
     edges = [_edge(control, model, math.log(end)) for end in GAIN_RANGE]
@@ -321,17 +323,12 @@ def describe(
     :param noise_std: standard deviation of the noise, which does not count as error [y].
     """
     error = step.setpoint - deviation
-    largest, at_peak = float(np.max(np.abs(deviation))), _AT_PEAK * noise_std
-    if step.setpoint != 0.0:
-        way = deviation / step.setpoint
-        overshoot = max(0.0, float(way.max()) - 1.0 - at_peak / abs(step.setpoint))
-    else:
-        side = 1.0 if deviation.max() >= -deviation.min() else -1.0
-        top, other = float((side * deviation).max()), float((-side * deviation).max())
-        overshoot = max(0.0, other - at_peak) / top if top > 0.0 else 0.0
-    outside = np.flatnonzero(
-        np.abs(error) > settled_band(abs(step.setpoint) or largest, noise_std)
-    )
+    largest = float(np.max(np.abs(deviation)))
+    size, overshoot = abs(step.setpoint) or largest, 0.0
+    if size > 0.0:
+        beyond = float(_beyond(deviation, step, largest).max())
+        overshoot = max(0.0, beyond - _AT_PEAK * noise_std / size)
+    outside = np.flatnonzero(np.abs(error) > settled_band(size, noise_std))
     settled = 0 if outside.size == 0 else min(int(outside[-1]) + 1, time.size - 1)
     # Noise alone has a mean absolute value of sqrt(2/pi) standard deviations.
     absolute = np.maximum(np.abs(error) - math.sqrt(2.0 / math.pi) * noise_std, 0.0)
@@ -341,6 +338,16 @@ def describe(
         iae=float(np.sum(0.5 * (absolute[1:] + absolute[:-1]) * np.diff(time))),
         largest=largest,
     )
+
+
+def _beyond(deviation: FloatArray, step: Step, largest: float) -> FloatArray:
+    """Return how far a response is beyond its step, as a part of that.
+
+    After a step of the load: to the other side than most, as a part of its largest deviation.
+    """
+    if step.setpoint:
+        return deviation / step.setpoint - 1.0
+    return deviation / (largest if deviation.max() < -deviation.min() else -largest)
 
 
 def compare(

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.experiment.parameters import FIRST_SHARE, ExperimentParameters
+from relay_autotune.experiment.settling import resolution
 from relay_autotune.reasons import Code, Reason
 from relay_autotune.record.record import Cycle
 
@@ -442,7 +443,7 @@ def clear_swing(noise_std: float, hysteresis: float, measurement: FloatArray) ->
     return max(
         CLEAR_OF_NOISE * noise_std,
         CLEAR_OF_HYSTERESIS * hysteresis,
-        CLEAR_OF_STEPS * _resolution(measurement),
+        CLEAR_OF_STEPS * resolution(measurement),
     )
 
 
@@ -461,12 +462,5 @@ def sought_swing(
     :param setpoint: about which the relay switches [y].
     :param measurement: samples of the oscillation [y], shape (n,).
     """
-    ample = _AMPLE * max(noise_std, _resolution(measurement))
+    ample = _AMPLE * max(noise_std, resolution(measurement))
     return p.target_amplitude or max(clear, min(ample, _OF_ROOM * p.room(setpoint)))
-
-
-def _resolution(measurement: FloatArray) -> float:
-    """Return the smallest difference between two samples that follow each other [y]."""
-    steps = abs(measurement[1:] - measurement[:-1])
-    steps = steps[steps > 0.0]
-    return float(steps.min()) if steps.size else 0.0

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -145,6 +145,16 @@ def slow_movement(measurement: FloatArray) -> tuple[float, float]:
     return float(np.ptp(blocks)), _MOVED_BY * noise
 
 
+def resolution(measurement: FloatArray) -> float:
+    """Return the smallest difference between two samples that follow each other, 0: none [y].
+
+    :param measurement: the samples [y], shape (n,).
+    """
+    steps = abs(measurement[1:] - measurement[:-1])
+    steps = steps[steps > 0.0]
+    return float(steps.min()) if steps.size else 0.0
+
+
 class RestWatch:
     """See that the measurement leaves the rest that it showed before the first command.
 
@@ -166,8 +176,7 @@ class RestWatch:
     def __init__(self, before: Sequence[float]) -> None:
         self._before = [float(value) for value in before]
         self._last = self._before[-1] if self._before else math.nan
-        steps = (abs(b - a) for a, b in zip(self._before, self._before[1:], strict=False))
-        self._resolution = min((step for step in steps if step > 0.0), default=math.inf)
+        self._resolution = resolution(np.array(self._before))
         self._rest = NOT_SETTLED
         self._independent = math.nan
         self._since = 0
@@ -182,7 +191,7 @@ class RestWatch:
         """Take a sample [y]; return True if the measurement has left its rest."""
         step = abs(measurement - self._last)
         if step > 0.0:
-            self._resolution = min(self._resolution, step)
+            self._resolution = min(self._resolution or step, step)
         self._last = measurement
         if len(self._before) < CONSTANT_SAMPLES:
             self._before.append(measurement)
@@ -207,8 +216,8 @@ class RestWatch:
         :param mean: measurement at the end of the settling [y].
         """
         rest = self._rest
-        steps = self._resolution if math.isfinite(self._resolution) else 0.0
-        least = max(_OUTSIDE_STD * rest.noise_std, _OUTSIDE_STEPS * steps, _UNSEEN * abs(mean))
+        steps = _OUTSIDE_STEPS * self._resolution
+        least = max(_OUTSIDE_STD * rest.noise_std, steps, _UNSEEN * abs(mean))
         return bool(rest.samples) and abs(mean - rest.mean) > least
 
     def _learn(self) -> None:
@@ -232,8 +241,7 @@ class RestWatch:
         rest, m = self._rest, self._independent
         n = rest.samples
         line = math.sqrt(1.0 + 1.0 / m + 12.0 * x * x / (m * n * n))
-        steps = self._resolution if math.isfinite(self._resolution) else 0.0
-        steps = max(steps, _UNSEEN * abs(rest.mean))
+        steps = max(self._resolution, _UNSEEN * abs(rest.mean))
         return (
             abs(rest.slope) * x
             + _OUTSIDE_STD * rest.noise_std * line
@@ -467,13 +475,14 @@ class DirectionWatch:
         left = sum(quarter) / len(quarter)
         return left if abs(left) >= _LEFT * self.largest else sum(self._means)
 
-    def _is_level(self) -> bool:
+    def _later_half(self) -> Iterator[tuple[float, float]]:
+        """Yield mean and error of the later intervals: a passage through the rest is shorter."""
         half = len(self._means) // 2
+        return zip(self._means[half:], self._errors[half:], strict=True)
+
+    def _is_level(self) -> bool:
         least = (1.0 - _LEVEL) * self.largest
-        return all(
-            mean >= least - 3.0 * error
-            for mean, error in zip(self._means[half:], self._errors[half:], strict=True)
-        )
+        return all(mean >= least - 3.0 * error for mean, error in self._later_half())
 
     def _tends_back(self) -> bool:
         """Extrapolate the return from the largest deviation, from three equal parts."""
@@ -491,10 +500,5 @@ class DirectionWatch:
         return end >= -_BACK * self.largest
 
     def _is_back(self) -> bool:
-        # For half of the time, so that a passage through the rest does not count.
-        half = len(self._means) // 2
-        largest = self.largest
-        return all(
-            abs(mean) <= max(_BACK * largest, 2.0 * error)
-            for mean, error in zip(self._means[half:], self._errors[half:], strict=True)
-        )
+        back = _BACK * self.largest
+        return all(abs(mean) <= max(back, 2.0 * error) for mean, error in self._later_half())

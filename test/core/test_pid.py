@@ -22,7 +22,7 @@ from relay_autotune.control.verification import (
     describe,
     noise_of,
     plan,
-    rounded_up,
+    rounded,
 )
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Controller
@@ -267,7 +267,7 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
     choice = StepChoice(record, model, Control(gains), Limits(30.0, 42.0), Limits(0.0, 5.0), 0.02)
     allowed = choice.allowed
     low, high = allowed.low, allowed.high
-    assert allowed.least == rounded_up(0.02 * wanted.visible) == pytest.approx(0.15, abs=0.04)
+    assert allowed.least == rounded(0.02 * wanted.visible) == pytest.approx(0.15, abs=0.04)
     # The command holds down to 3.3 below; the peak of the next step of two digits is too high.
     assert low == -3.3
     at_peak = [
