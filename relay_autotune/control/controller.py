@@ -120,7 +120,8 @@ class PidController:
         self.gains = gains
         """The gains in force; changed by `use`."""
         self._limits = limits
-        self._automatic = automatic
+        self.is_manual = not automatic
+        """True if it was switched to manual."""
         self.command = limits.clip(command)
         """The last command [u]."""
         self._law: PidLaw | None = None
@@ -133,12 +134,7 @@ class PidController:
     @property
     def is_automatic(self) -> bool:
         """True if it controls, False if it holds its command."""
-        return self._automatic and self.gains is not None
-
-    @property
-    def is_manual(self) -> bool:
-        """True if it was switched to manual."""
-        return not self._automatic
+        return not self.is_manual and self.gains is not None
 
     def use(self, gains: Controller | None) -> None:
         """Change the gains without a bump.
@@ -159,7 +155,7 @@ class PidController:
 
     def switch(self, *, automatic: bool) -> None:
         """Go to automatic, from the present command on, or to manual."""
-        self._automatic = automatic
+        self.is_manual = not automatic
         self._align = True
 
     def track(self, command: float) -> None:
@@ -198,7 +194,7 @@ class PidController:
         self, gains: Controller, interval: float, setpoint: float, measurement: float
     ) -> float:
         law = self._heard(gains, interval, measurement)
-        if self._align or not self._automatic:
+        if self._align or self.is_manual:
             # Set the integral so that the command continues from its present value.
             law.integral = self.command - law.proportional(gains, setpoint)
             self._align = False
@@ -244,7 +240,7 @@ class LawController(PidController):
         self, gains: Controller, interval: float, setpoint: float, measurement: float
     ) -> float:
         period = self._rate.period
-        if self._align or not self._automatic:
+        if self._align or self.is_manual:
             self._running = self._rate.of(gains).running()
             self._running.take_over(setpoint, measurement, self.command)
             self._align, self._wait = False, period

@@ -39,7 +39,6 @@ from relay_autotune.experiment.phases import (
     Kick,
     Left,
     Probe,
-    Samples,
     Settle,
     Setup,
     State,
@@ -122,11 +121,8 @@ class RelayExperiment:
         self.state = State.SETTLING
         """The present state."""
         self._levels = Levels(parameters, self.baseline, from_small=from_small)
-        self._trace = Samples()
-        self._notes: list[Reason] = []
-        self._setup = Setup(
-            parameters, self.baseline, until_converged, self._levels, self._trace, self._notes
-        )
+        self._setup = Setup(parameters, self.baseline, until_converged, self._levels)
+        self._trace = self._setup.trace
         self._phase: Phase = Settle(self._setup, before)
         self._relay: Switching | None = None
         self._facts = Facts(sign=parameters.process_gain_sign)
@@ -219,7 +215,7 @@ class RelayExperiment:
         """Why it ended, with notes; its code is NONE before."""
         if not self._why:
             return NONE
-        notes, silent = [*self._notes], self._silence.silence
+        notes, silent = [*self._setup.notes], self._silence.silence
         if repeated := self._silence.repeated:
             at_end = self.outcome is not Outcome.COMPLETED and silent > 0.0
             notes.append(

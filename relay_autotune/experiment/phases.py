@@ -13,7 +13,7 @@ import enum
 import math
 from array import array
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -152,9 +152,9 @@ class Setup:
     until_converged: bool
     levels: Levels
     """The levels of the relay."""
-    trace: Samples
+    trace: Samples = field(default_factory=Samples)
     """The samples so far; each is appended before it is answered."""
-    notes: list[Reason]
+    notes: list[Reason] = field(default_factory=list)
     """What else is to be known of the experiment, in the order in which it was found."""
 
     @property

@@ -145,12 +145,8 @@ class LoopClient:
         :param topic: its unresolved name.
         """
         came: list[Any] = []
-        self._node.create_subscription(
-            kind,
-            self._resolved(topic),
-            lambda message: came.append(made_visible(message)),
-            quality.latched(_MOST_HEARD),
-        )
+        profile = quality.latched(_MOST_HEARD)
+        self._ends.enter_context(self._hearing(kind, topic, came.append, profile))
         return came
 
     def heard(
