@@ -17,7 +17,7 @@ import json
 import os
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -143,8 +143,8 @@ class GainsJournal:
         return partial(self._save, history, self._newest)
 
     def _save(self, history: GainsHistory, ticket: int) -> None:
-        document = {"version": _VERSION, "loop": self._loop, **_values_of(history)}
-        text = json.dumps(document, indent=1, allow_nan=False) + "\n"
+        document = {"version": _VERSION, "loop": self._loop, **vars(history)}
+        text = json.dumps(document, indent=1, allow_nan=False, default=_plain) + "\n"
         new = self.path.with_suffix(".tmp")
         with self._lock:
             if ticket != self._newest:
@@ -176,17 +176,11 @@ def _unreadable(path: Path, why: str) -> JournalError:
     )
 
 
-def _values_of(value: Any) -> Any:
-    """Return a history, or a part of it, as JSON values."""
+def _plain(value: GainSet | Entry | Standing | Work) -> Any:
+    """Return a part of a history as JSON has it."""
     if isinstance(value, GainSet):
         return value.by_name()
-    if isinstance(value, (Standing, Work)):
-        return value.value
-    if isinstance(value, tuple):
-        return [_values_of(each) for each in value]
-    if value is None:
-        return None
-    return {field.name: _values_of(getattr(value, field.name)) for field in fields(value)}
+    return vars(value) if isinstance(value, Entry) else value.value
 
 
 def _history_of(found: dict[str, Any]) -> GainsHistory:

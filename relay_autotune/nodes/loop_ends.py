@@ -229,8 +229,9 @@ class BumplessTransfer:
 
     def note(self, command: float) -> None:
         """Note a command that the controller has sent to the actuator directly [u]."""
-        self.last, self._arrived = command, time.monotonic()
-        self._kept.append(command)
+        if math.isfinite(command):
+            self.last, self._arrived = command, time.monotonic()
+            self._kept.append(command)
 
     def take_over(self) -> None:
         """Stop passing on the controller's commands."""
@@ -390,7 +391,9 @@ class LoopSupervisor:
         """
         self._was_connected = self.is_connected
         self._experiment, self._gives_back = experiment, gives_back
-        self._overtime = watch.Overtime.of(experiment, self._node, self._sensor)
+        pause = max(self._sensor.timeout, self._sensor.repeat_period)
+        simulated = self._value("use_sim_time")
+        self._overtime = watch.Overtime(experiment, pause, simulated=simulated)
         self._sensor.begin()
         self.commanded = math.nan
         if self._ends.setpoint is None:
@@ -476,11 +479,6 @@ class LoopSupervisor:
 
     def _note_own(self, command: float) -> None:
         self._own.append(self._messages.on_wire(command))
-
-    def report(self, command: float) -> None:
-        """Take what the controller says that it commands the actuator itself [u]."""
-        if math.isfinite(command):
-            self.handover.note(command)
 
     def _on_command(self, message: Any) -> None:
         """Take a message on the command topic, where other nodes may publish, too."""

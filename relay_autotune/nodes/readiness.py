@@ -84,11 +84,6 @@ class Checklist:
         """Why each check that failed did so."""
         return [check.why for check in self.checks if check.mark is Mark.NO]
 
-    @property
-    def lines(self) -> list[str]:
-        """One line for each check."""
-        return list(map(str, self.checks))
-
     def do(self, name: str, work: Callable[[], _T], found: Callable[[_T], str]) -> _T | None:
         """Make a check.
 
@@ -113,10 +108,8 @@ class Checklist:
         :param found: what was found; as a reason, it is to be known.
         :param mark: of a text.
         """
-        line = ChecklistLine(mark, name, str(found))
-        if isinstance(found, Reason):
-            line = ChecklistLine(Mark.NOTE, name, str(found), found)
-        self.checks.append(line)
+        why = found if isinstance(found, Reason) else NONE
+        self.checks.append(ChecklistLine(Mark.NOTE if why else mark, name, str(found), why))
 
 
 def answer_of(checks: Checklist, **facts: Any) -> StartTune.Response:
@@ -126,7 +119,7 @@ def answer_of(checks: Checklist, **facts: Any) -> StartTune.Response:
     :param facts: further fields; without them it is refused for the first check that failed.
     """
     answer = StartTune.Response(**facts) if facts else refused(checks.refusals[0])
-    answer.checks = checks.lines
+    answer.checks = list(map(str, checks.checks))
     for check in checks.checks:
         answer.refusals.append(ReasonMessage())
         fill_reason(answer.refusals[-1], check.why)

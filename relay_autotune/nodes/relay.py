@@ -136,7 +136,7 @@ class RelayNode(ServedNode):
         if self._reported is not None:
             # After the answer: it belongs to this sample, and the one before is still needed.
             try:
-                self._loop.report(self._reported(message))
+                self._loop.handover.note(self._reported(message))
             except FieldError as error:
                 what, why = "controller's command", str(error)
                 self._stop_now(Code.MISREAD(what=what, topic=self._topic, why=why))

@@ -269,9 +269,7 @@ class Verifier:
             reason = f"{reason}; {_why(error)}"
         self._watch.cancel()
         self._action.running = None
-        steps = [without_arrays(message) for message in self._found]
-        result = _result(passed is True, why, reason, steps)
-        self._found = []
+        result = _result(passed is True, why, reason, self._found)
         conclude(goal, result, succeeded=succeeded)
 
     async def _course(self, request: Any) -> tuple[bool | None, Reason]:
@@ -322,6 +320,9 @@ class Verifier:
                 return None, Code.NOT_JUDGED(why=str(_why(error)))
             self._found.append(message)
             self._full.publish(message)
+            # The client gets it without the samples, which the topic has.
+            for name in ("time", "measurement", "command", "predicted"):
+                setattr(message, name, [])
             whys.append(reason_from_message(message.why, message.reason))
             if not message.passed:
                 return False, whys[-1]
@@ -579,15 +580,6 @@ def judged(tried: Verifiable, trial: Trial) -> Any:
         setattr(message, f"{name}_predicted", getattr(found.expected, name))
     set_stamp(message.header.stamp, round(float(t[0]) * 1e9))
     return message
-
-
-def without_arrays(message: Any) -> Any:
-    """Return a `Verification` without its samples, which the topic has."""
-    summary = Verification()
-    for name, kind in message.get_fields_and_field_types().items():
-        if not kind.startswith("sequence"):
-            setattr(summary, name, getattr(message, name))
-    return summary
 
 
 def _why(error: Exception) -> Reason:

@@ -528,33 +528,22 @@ now = time.monotonic
 class Overtime:
     """A limit on the duration of a tune by the steady clock, for any clock of its samples.
 
-    The samples' time may stand still for ``standing`` seconds, as with a stuck ``/clock``. The
-    tune may take ``slack`` times as long as the experiment and its present part may take by the
+    The samples' time may stand still for some seconds, as with a stuck ``/clock``. The tune may
+    take some times as long as the experiment and its present part may take by the
     samples' time.
 
     :param experiment: the tune.
-    :param standing: longest time without progress of the samples' time [s].
-    :param slack: how many times slower than the steady clock that time may go, at most.
+    :param pause: longest time between two samples [s].
+    :param simulated: True if their time is that of a simulation.
     """
 
-    def __init__(self, experiment: RelayExperiment, standing: float, slack: float) -> None:
+    def __init__(self, experiment: RelayExperiment, pause: float, *, simulated: bool) -> None:
         self._experiment = experiment
-        self._standing = standing
-        self._slack = slack
+        self._standing = max(_STANDING * pause, _LEAST_STANDING)
+        by_number = experiment.parameters.sample_period > 0.0
+        self._slack = _SLACK_SIMULATED if simulated or by_number else _SLACK
         self._begin = self._moved_at = now()
         self._elapsed = math.nan
-
-    @classmethod
-    def of(cls, experiment: RelayExperiment, node: Node, sensor: Sensor) -> Overtime:
-        """Return the limit that follows from the node's parameters and its sensor."""
-        pauses = sensor.timeout, sensor.repeat_period
-        simulated = bool(node.get_parameter("use_sim_time").value)
-        by_number = experiment.parameters.sample_period > 0.0
-        return cls(
-            experiment,
-            max(_STANDING * max(pauses), _LEAST_STANDING),
-            _SLACK_SIMULATED if simulated or by_number else _SLACK,
-        )
 
     def problem(self) -> Reason | None:
         """Return a reason if a limit is passed."""

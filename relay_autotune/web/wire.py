@@ -96,7 +96,7 @@ def of_subject(subject: PageModel) -> dict[str, Any]:
         "present": of_present(subject),
         "may_shape": subject.shaping is not None,
         "around": len(subject.shaping.task.models) if subject.shaping is not None else 0,
-        "first": of_asked(subject.first),
+        "first": vars(subject.first),
         "slider": [CALM, FAST, STEP],
         "amplitude": _noisy_amplitude(subject.shaping),
     }
@@ -156,11 +156,6 @@ def of_present(subject: PageModel) -> dict[str, Any]:
     return {"rows": shown, "steps": steps}
 
 
-def of_asked(asked: DesignRequest) -> dict[str, Any]:
-    """Return what is asked of the gains, as the page sends it back."""
-    return dict(vars(asked))
-
-
 def of_shaped(subject: PageModel, shaped: DesignResult) -> dict[str, Any]:
     """Return gains and what they do.
 
@@ -181,7 +176,7 @@ def of_shaped(subject: PageModel, shaped: DesignResult) -> dict[str, Any]:
         count = len(subject.shaping.task.models) if subject.shaping is not None else 0
         notes.append(f"On {shaped.unstable} of {count} models around, the loop is unstable.")
     return {
-        "asked": of_asked(shaped.asked),
+        "asked": vars(shaped.asked),
         "rule": gains.rule,
         "reason": visible(gains.reason),
         "verdict": _verdict(case),

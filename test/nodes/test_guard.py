@@ -187,11 +187,13 @@ def test_a_namesake_has_the_name_and_the_namespace():
 )
 def test_a_tune_ends_by_the_steady_clock(monkeypatch, rate, most, duration, expected):
     tune = SimpleNamespace(
-        elapsed=0.0, latest=most, parameters=SimpleNamespace(max_duration=duration)
+        elapsed=0.0,
+        latest=most,
+        parameters=SimpleNamespace(max_duration=duration, sample_period=0.0),
     )
     present = 1000.0
     monkeypatch.setattr(watch, "now", lambda: present)
-    look, why = Overtime(tune, standing=5.0, slack=3.0).problem, None
+    look, why = Overtime(tune, 2.5, simulated=False).problem, None
     # An experiment that goes on by its own time ends by its own limit.
     while why is None and rate * (present - 1000.0) <= most:
         present += 0.05
