@@ -112,7 +112,7 @@ class Page:
             number = len(self.subjects) - 1
         self.changed()
         if subject.shaping is not None:
-            self.worker.ask(partial(self._answer, number, subject.first))
+            self.worker.ask(partial(self.answer, number, subject.first))
         return number
 
     def changed(self) -> None:
@@ -129,7 +129,7 @@ class Page:
                 key = number, asked
                 if key not in self._known and self._begun[key] < _MOST_BEGUN:
                     self._begun[key] += 1
-                    return partial(self._answer, number, asked)
+                    return partial(self.answer, number, asked)
         return None
 
     def question(self, number: object, given: object) -> tuple[int, DesignRequest]:
@@ -153,14 +153,6 @@ class Page:
             self._last[number] = asked
         return self._known.get((number, asked))
 
-    def ask(self, number: int, asked: DesignRequest) -> Future[str]:
-        """Compute the answer to what a page asks.
-
-        :param number: of the model.
-        :param asked: what is asked for.
-        """
-        return self.worker.ask(partial(self._answer, number, asked))
-
     def sketch(self, number: int, asked: DesignRequest) -> str | None:
         """Return gains that come near to what is asked for; None: too little is known.
 
@@ -176,7 +168,12 @@ class Page:
             return None
         return wire.to_text({"sketched": wire.of_shaped(subject, shaped)})
 
-    def _answer(self, number: int, asked: DesignRequest) -> str:
+    def answer(self, number: int, asked: DesignRequest) -> str:
+        """Return the answer to what a page asks, as JSON.
+
+        :param number: of the model.
+        :param asked: what is asked for.
+        """
         known = self._known.get((number, asked))
         if known is not None:
             return known
@@ -428,7 +425,8 @@ class _Socket(_Guarded, WebSocketHandler):
             if sketch is not None:
                 self._tell_answer(head, sketch, begun)
         try:
-            answer = await asyncio.wrap_future(self.page.ask(number, asked))
+            exact = partial(self.page.answer, number, asked)
+            answer = await asyncio.wrap_future(self.page.worker.ask(exact))
         except RelayAutotuneError as error:
             answer = self.page.keep(number, asked, _refused(error))
         self._tell_answer(head, answer, begun)

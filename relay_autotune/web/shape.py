@@ -134,18 +134,6 @@ class Steps:
 
 
 @dataclass(frozen=True)
-class LoopCurve:
-    """The loop about the point -1.
-
-    :param loop: its values, shape (f,).
-    :param band: polygons that cover the 95 % band of the models around.
-    """
-
-    loop: ComplexArray
-    band: Sequence[FloatArray]
-
-
-@dataclass(frozen=True)
 class DesignResult:
     """Gains as they were asked for, and what they do.
 
@@ -153,7 +141,8 @@ class DesignResult:
     :param gains: the gains.
     :param judgement: of the experiment with these gains.
     :param steps: responses of the closed loop.
-    :param curve: the loop.
+    :param loop: values of the loop about the point -1, shape (f,).
+    :param band: polygons that cover the 95 % band of the models around.
     :param unstable: number of models around on which the loop is unstable.
     :param options: with which they were designed.
     """
@@ -162,7 +151,8 @@ class DesignResult:
     gains: Gains
     judgement: Judgement
     steps: Steps
-    curve: LoopCurve
+    loop: ComplexArray
+    band: Sequence[FloatArray]
     unstable: int
     options: DesignOptions
 
@@ -344,7 +334,7 @@ def _shaped(
         gains,
         judgement,
         _steps(loop, task, steady, *scale),
-        _curve(gains, shaping),
+        *_curve(loop, gains, task),
         unstable,
         task.options,
     )
@@ -373,9 +363,10 @@ def _steps(
     return Steps(setpoint.time, measurement, command, low, high, load, half)
 
 
-def _curve(gains: Gains, shaping: Shaping) -> LoopCurve:
-    task = shaping.task
-    loop = task.loop(gains)
+def _curve(
+    loop: Loop, gains: Gains, task: DesignTask
+) -> tuple[ComplexArray, Sequence[FloatArray]]:
+    """Return a loop about the point -1, and its band."""
     w = loop_frequencies(gains.loop(task.process))
     if loop.law.period > 0.0:
         w = w[w * loop.law.period < math.pi]
@@ -387,7 +378,7 @@ def _curve(gains: Gains, shaping: Shaping) -> LoopCurve:
         some = w[:: max(1, w.size // _BAND)]
         around = loop.law(1j * some)[:, None] * task.around.at(some)
         band = swept_parts(around[np.all(np.abs(around) < _FAR, axis=1)].T)
-    return LoopCurve(values, band)
+    return values, band
 
 
 def asked_of(given: object, rules: tuple[str, ...]) -> DesignRequest:

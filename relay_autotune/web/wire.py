@@ -203,9 +203,9 @@ def of_shaped(subject: PageModel, shaped: DesignResult) -> dict[str, Any]:
             "load_time": steps.load_time,
         },
         "nyquist": {
-            "re": short(shaped.curve.loop.real),
-            "im": short(shaped.curve.loop.imag),
-            "band": [short(part.ravel()) for part in shaped.curve.band],
+            "re": short(shaped.loop.real),
+            "im": short(shaped.loop.imag),
+            "band": [short(part.ravel()) for part in shaped.band],
         },
         "command": visible(case.command),
     }
