@@ -169,8 +169,11 @@ class _Log:
         else:
             self._log.warning(visible(text))
 
-    def error(self, text: str) -> None:
-        self._log.error(visible(text))
+    def error(self, text: str, throttle_duration_sec: float = 0.0) -> None:
+        if throttle_duration_sec:
+            self._log.error(visible(text), throttle_duration_sec=throttle_duration_sec)
+        else:
+            self._log.error(visible(text))
 
     def fatal(self, text: str) -> None:
         self._log.fatal(visible(text))

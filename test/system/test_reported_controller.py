@@ -6,9 +6,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from fopdt_plant import FopdtPlant
 from loop_rig import RELIABLE, Rig
 from ros_domain import free_domain
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
 
 from relay_autotune_msgs.msg import RelayExperiment
 
@@ -129,3 +131,25 @@ def test_a_joint_is_tuned_while_its_controller_stays_active(rig: Rig) -> None:
     rig.until(lambda: controller.heard[-1].velocity[1] == REST, "the set-point")
     controller.joints = ["right", "left"]
     controller.command = 0.0
+
+
+def test_a_controller_outlives_a_measurement_without_its_joint(rig: Rig) -> None:
+    commands = rig.listen("controller_command", Float64, RELIABLE)
+    node = rig.start(
+        "controller_node",
+        measurement_type="sensor_msgs/msg/JointState",
+        measurement_field="velocity[left]",
+        initial_command=0.25,
+    )
+    states = rig.node.create_publisher(JointState, "measurement", 100)
+
+    def after(joint: str, condition: Callable[[], Any]) -> Any:
+        states.publish(JointState(name=[joint], velocity=[1.0]))
+        return condition()
+
+    why = "the measurement cannot be read: velocity[left]"
+    rig.until(lambda: after("left", lambda: commands), "a command")
+    rig.until(lambda: after("right", lambda: why in node.log or not node.running), "the reason")
+    count = len(commands)
+    rig.until(lambda: after("left", lambda: len(commands) > count + 50), "commands", 20.0)
+    assert {message.data for message in commands} == {0.25}
