@@ -291,7 +291,7 @@ def _element(
         raise FieldError(
             f"{of} has no {path!r}: an array of {array.count} elements ends at [{array.count - 1}]"
         )
-    names = _said_names(array, key, around) if key else _own_names(array, around)
+    names = _names_of(array, key, around)
     if by_place:
         return Element(int(name), names if isinstance(names, Names) else None)
     if isinstance(names, Names):
@@ -312,30 +312,26 @@ def _element(
     )
 
 
-def _said_names(array: Repeated, key: str, around: Sequence[tuple[int, Struct]]) -> Names | None:
-    if isinstance(array.item, Struct):
-        own = dict(array.item.fields).get(key)
-        whole = isinstance(own, Number) and own.form[0] in "ui"
-        if whole or (isinstance(own, Text) and not own.wide):
-            return Names(key, None)
-    for depth, struct in reversed(around):
-        if _is_list(dict(struct.fields).get(key)):
-            return Names(key, depth)
-    return None
+def _names_of(
+    array: Repeated, key: str, around: Sequence[tuple[int, Struct]]
+) -> Names | list[str] | None:
+    """Return what names the elements of an array; several lists: their names; None: nothing.
 
-
-def _own_names(array: Repeated, around: Sequence[tuple[int, Struct]]) -> Names | list[str] | None:
+    :param array: the array.
+    :param key: the field or the list that is meant; empty: the usual ones.
+    :param around: the structures on the way to it.
+    """
+    own, lists = key or _OWN_NAME, (key,) if key else NAME_LISTS
     if isinstance(array.item, Struct):
-        own = dict(array.item.fields).get(_OWN_NAME)
-        if isinstance(own, Text) and not own.wide:
-            return Names(_OWN_NAME, None)
+        kind = dict(array.item.fields).get(own)
+        whole = bool(key) and isinstance(kind, Number) and kind.form[0] in "ui"
+        if whole or (isinstance(kind, Text) and not kind.wide):
+            return Names(own, None)
     for depth, struct in reversed(around):
         fields = dict(struct.fields)
-        found = [name for name in NAME_LISTS if _is_list(fields.get(name))]
-        if len(found) == 1:
-            return Names(found[0], depth)
+        found = [name for name in lists if _is_list(fields.get(name))]
         if found:
-            return found
+            return Names(found[0], depth) if len(found) == 1 else found
     return None
 
 

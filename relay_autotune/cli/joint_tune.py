@@ -296,21 +296,16 @@ class JointLoop(Loop):
     def arguments(self) -> dict[str, list[str]]:
         """Return the arguments for ROS of the nodes that tune it."""
         loop, options = self._loop, self.options
-        topics, values = self._opened_ends() if options.open else self._closed_ends()
+        topics, values = self._opened_ends() if options.open else self._at_controller()
+        if not options.open:
+            # It moves the reference.
+            values |= {"relay_on": "setpoint", "setpoint": loop.state.reference}
         values |= self.answers.parameters((*self.form, "measurement_timeout"))
         nodes = {"relay_node": ros_arguments(self.space, topics, values)}
         if not options.record_only:
             design = {"law": loop.law, "sample_period": loop.period}
             nodes["identifier_node"] = ros_arguments(self.space, {}, design)
         return nodes
-
-    def _closed_ends(self) -> tuple[dict[str, str], dict[str, Any]]:
-        """Return topics and parameters of a relay_node that moves the reference."""
-        topics, values = self._at_controller()
-        return topics, values | {
-            "relay_on": "setpoint",
-            "setpoint": self._loop.state.reference,
-        }
 
     def _at_controller(self) -> tuple[dict[str, str], dict[str, Any]]:
         """Return topics and parameters of a node that hears the controller and moves it."""

@@ -68,17 +68,12 @@ def model_of_fields(m: dict[str, Any]) -> TransferFunction:
 
     :raises ModelError: if it is not a transfer function.
     """
-    found = TransferFunction.from_polynomials(
-        [number(c) for c in m["numerator"]],
-        [number(c) for c in m["denominator"]],
-        number(m["dead_time"]),
-        str(m.get("structure", GENERAL)),
-    )
-    constants = tuple(_complex(c) for c in m["time_constants"])
-    zeros = tuple(_complex(c) for c in m["zeros"])
-    # Roots of the polynomials would come back rounded.
+    zeros, constants = (tuple(map(_complex, m[n])) for n in ("zeros", "time_constants"))
+    # The polynomials count the integrators; their roots would come back rounded.
+    integrators = len(m["denominator"]) - len(constants) - len(m["numerator"]) + len(zeros)
+    structure = str(m.get("structure", GENERAL))
     return TransferFunction(
-        number(m["gain"]), zeros, constants, found.integrators, found.dead_time, found.structure
+        number(m["gain"]), zeros, constants, integrators, number(m["dead_time"]), structure
     )
 
 
