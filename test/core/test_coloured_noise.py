@@ -23,9 +23,7 @@ from relay_autotune.identification.waveform.candidates import (
     support,
 )
 from relay_autotune.identification.waveform.choice import (
-    _best_of_all,
     _compared,
-    _Reached,
     _simulates,
     chosen_fit,
 )
@@ -322,17 +320,6 @@ def test_a_model_whose_response_the_colour_explains_does_not_simulate():
     least = right.state.cost / problem.time.size
     assert _simulates(right, least)
     assert not _simulates(bent, least)
-
-
-def test_a_colour_counts_where_it_simulates_as_well_as_other_terms_do():
-    """Beside a drift the best simulation is worse, and a worse model passed for as good."""
-    right = fitted_to_two_steps()
-    problem = right.problem
-    late = replace(right, state=evaluate(problem, right.state.theta + np.array((0.0, 3.0))))
-    likely = replace(late, score=right.score - 1e6)
-    beside = _Reached(simulated=[late], coloured=[[likely]])
-    assert _best_of_all([beside]) == [likely]
-    assert _best_of_all([_Reached([right], []), beside]) == [right]
 
 
 def test_starts_know_what_is_estimated_beside_the_model():

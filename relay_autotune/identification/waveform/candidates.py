@@ -289,28 +289,32 @@ class FitContext:
 
         :param candidate: in white noise.
         """
-        found = []
-        for terms in self.terms:
-            if all(nuisances_of(candidate.problem, terms)):
-                continue
-            if "relaxation" in terms and not candidate.structure.factors:
-                # The free state of an integrator is the offset.
-                continue
-            if "friction" in terms and not candidate.structure.integrators:
-                # It acts against the motion of a position.
-                continue
-            if terms == ("load",):
-                problem, state = with_load(candidate.problem, candidate.state)
-            else:
-                changed: dict[str, Any] = dict.fromkeys(terms, True)
-                problem = replace(candidate.problem, **changed)
-                state = refine(problem, candidate.state.theta, tolerance=TRIAL, most=STEPS)
-                if not _BEFORE.isdisjoint(terms):
-                    state = self._out_of_a_wrong_minimum(problem, state)
-            other = self.candidate(problem, state)
-            if other is not None:
-                found.append(other)
-        return found
+        return [each for terms in self.terms for each in self.with_terms(candidate, terms)]
+
+    def with_terms(self, candidate: Candidate, terms: tuple[str, ...]) -> list[Candidate]:
+        """Return a candidate with further terms beside the model; none where it has no such.
+
+        :param candidate: in white noise.
+        :param terms: some of ``TERMS``.
+        """
+        if all(nuisances_of(candidate.problem, terms)):
+            return []
+        if "relaxation" in terms and not candidate.structure.factors:
+            # The free state of an integrator is the offset.
+            return []
+        if "friction" in terms and not candidate.structure.integrators:
+            # It acts against the motion of a position.
+            return []
+        if terms == ("load",):
+            problem, state = with_load(candidate.problem, candidate.state)
+        else:
+            changed: dict[str, Any] = dict.fromkeys(terms, True)
+            problem = replace(candidate.problem, **changed)
+            state = refine(problem, candidate.state.theta, tolerance=TRIAL, most=STEPS)
+            if not _BEFORE.isdisjoint(terms):
+                state = self._out_of_a_wrong_minimum(problem, state)
+        other = self.candidate(problem, state)
+        return [] if other is None else [other]
 
     def _out_of_a_wrong_minimum(self, problem: Problem, state: Trial) -> Trial:
         """Return a fit with a further term, begun anew where a FOPDT explains more.

@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,7 +27,6 @@ from relay_autotune.identification.waveform.candidates import (
     FitContext,
     as_in,
     drop_first_dead_time,
-    nuisances_of,
 )
 from relay_autotune.identification.waveform.fit_covariance import Fit, raw_residual
 from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem
@@ -255,10 +254,9 @@ def _dense_enough(problem: Problem, sign: int, held: bool) -> FitContext:
 
 
 def _compared(context: FitContext, known: Known, among: Sequence[str] = TRIED) -> list[Candidate]:
-    """Return all structures in one colour, the best first.
+    """Return all structures in one colour, with the terms beside them, the best first.
 
-    Where no relay held the process, a step of the load counts only if white noise is all that is
-    left: between a few steps, a slow disturbance looks like a load as well.
+    The terms are decided with a few simple structures.
     """
     # What runs away by itself is not recorded, except where a relay held it.
     names = [n for n in among if context.held or not TABLE[n].unstable]
@@ -266,74 +264,95 @@ def _compared(context: FitContext, known: Known, among: Sequence[str] = TRIED) -
     if known.structure:
         names = first = [known.structure]
     simple = context.fit(first, known.order)
-    found = _with_terms(context, known, names, simple)
-    if context.loads or not found or found[0].problem.colour is None:
+    if not simple:
+        return []
+    decided = _with_best_terms(context, simple)
+    found = _beside_terms(context, known, names, decided, simple)
+    if context.loads or len(context.problem.bounds) > 1:
         return found
-    loaded = _with_terms(replace(context, loads=True), known, names, simple)
-    if not loaded or loaded[0].problem.colour is not None or loaded[0].score >= found[0].score:
+    if not found or found[0].problem.colour is None:
         return found
-    return loaded if ljung_box(loaded[0].state.residual) >= _CHANCE else found
+    return _with_a_load(replace(context, loads=True), known, names, found, simple) or found
 
 
-def _with_terms(
-    context: FitContext, known: Known, names: Sequence[str], simple: list[Candidate]
+def _with_a_load(
+    context: FitContext,
+    known: Known,
+    names: Sequence[str],
+    found: Sequence[Candidate],
+    simple: Sequence[Candidate],
 ) -> list[Candidate]:
-    """Return structures with the terms beside the model that a record needs, the best first.
+    """Return structures beside a step of the load, the best first; none where that explains less.
 
-    The terms are decided with a few simple structures, and again with the best one of all.
+    Where no relay held the process, a load counts only if white noise is all that is left:
+    between a few steps, a slow disturbance looks like a load as well.
+
+    :param context: the samples; a load may be estimated.
+    :param known: the structure, if it is known.
+    :param names: of the structures.
+    :param found: all without a load, the best first.
+    :param simple: some of them in white noise, without any terms.
+    """
+    best = context.refit(found[0], None)
+    loaded = [
+        each
+        for without in (*simple, *([] if best is None else [best]))
+        for each in context.with_terms(without, ("load",))
+        if _colour(each.problem, each.state) is None
+    ]
+    if not loaded:
+        return []
+    decided = min(loaded, key=lambda c: c.score)
+    again = _beside_terms(context, known, names, decided, loaded)
+    if not again or again[0].problem.colour is not None or again[0].score >= found[0].score:
+        return []
+    return again if ljung_box(again[0].state.residual) >= _CHANCE else []
+
+
+def _beside_terms(
+    context: FitContext,
+    known: Known,
+    names: Sequence[str],
+    decided: Candidate,
+    ready: Sequence[Candidate],
+) -> list[Candidate]:
+    """Return structures with the terms of one candidate, in the likeliest colour, the best first.
 
     :param context: the samples, and the terms that may be estimated.
     :param known: the structure, if it is known.
     :param names: of the structures.
-    :param simple: some of them in white noise, without such terms.
+    :param decided: has the terms, in white noise.
+    :param ready: fitted before, in white noise.
     """
-    found: list[Candidate] = []
-    reached: list[_Reached] = []
-    tried: set[tuple[bool, ...]] = set()
-    decided = _with_best_terms(context, simple)
-    if context.loads and not context.held:
-        # All without a load were compared before.
-        decided = [c for c in decided if c.problem.load is not None]
-    while decided:
-        white = (context.refit(c, None) for c in decided)
-        ready = [*simple, *(c for c in white if c is not None)]
-        for each in decided:
-            if nuisances_of(each.problem) not in tried:
-                tried.add(nuisances_of(each.problem))
-                some = [n for n in names if TABLE[n].integrators or not each.problem.friction]
-                inside = context.with_nuisances_of(each)
-                reached.append(_reached(inside, inside.fit(some, known.order, ready)))
-        found = _best_of_all(reached)
-        if not found or known.structure:
-            break
-        # The best structure of all may need others than the simple ones.
-        again = _with_best_terms(context, [context.refit(found[0], None) or found[0]])
-        decided = [
-            c for c in again if c.score < found[0].score and nuisances_of(c.problem) not in tried
-        ]
-    return found
+    some = [n for n in names if TABLE[n].integrators or not decided.problem.friction]
+    inside = context.with_nuisances_of(decided)
+    return _likeliest_colour(inside, inside.fit(some, known.order, (*ready, decided)))
 
 
-def _with_best_terms(context: FitContext, found: Sequence[Candidate]) -> list[Candidate]:
-    """Return candidates with the terms beside the model that improve their score, the best first.
+def _with_best_terms(context: FitContext, simple: Sequence[Candidate]) -> Candidate:
+    """Return the best of some candidates with the terms beside the model that improve its score.
 
     They are added one after the other, each time the one that improves the score most in the
-    colour of its own residual. Those far worse than the best are left out.
+    colour of its own residual: where a structure is too simple, the colour explains what a term
+    would.
+
+    :param simple: in white noise, at least one.
     """
-    reached = []
-    # A command off the balance of an integrator looks like a drift, and where a structure is too
-    # simple the colour explains what a term would.
-    for now in found:
-        best = _in_own_colour(context, now)
-        while more := context.with_one_more_term(now):
-            pairs = [(_in_own_colour(context, c), c) for c in more]
-            coloured, plain = min(pairs, key=lambda r: r[0].score)
-            if coloured.score >= best.score:
-                break
-            now, best = plain, coloured
-        reached.append(best)
-    reached.sort(key=lambda c: c.score)
-    return [c for c in reached if c.score <= reached[0].score + _HOPELESS]
+    best, now = _best_in_own_colour(context, simple)
+    while more := context.with_one_more_term(now):
+        coloured, plain = _best_in_own_colour(context, more)
+        if coloured.score >= best.score:
+            break
+        now, best = plain, coloured
+    return now
+
+
+def _best_in_own_colour(
+    context: FitContext, found: Sequence[Candidate]
+) -> tuple[Candidate, Candidate]:
+    """Return the best of some candidates, in the colour of its residual and as it was."""
+    pairs = ((_in_own_colour(context, c), c) for c in found)
+    return min(pairs, key=lambda pair: pair[0].score)
 
 
 def _in_own_colour(context: FitContext, candidate: Candidate) -> Candidate:
@@ -343,53 +362,26 @@ def _in_own_colour(context: FitContext, candidate: Candidate) -> Candidate:
     return candidate if coloured is None else min(candidate, coloured, key=lambda c: c.score)
 
 
-@dataclass(frozen=True)
-class _Reached:
-    """All structures with the same terms beside them.
-
-    :param simulated: fitted to the measurement itself, the best first.
-    :param coloured: in each colour that was found, the best first; none where the best
-        simulation leaves white noise.
-    """
-
-    simulated: list[Candidate]
-    coloured: list[list[Candidate]]
-
-
-def _reached(context: FitContext, simulated: list[Candidate]) -> _Reached:
-    """Return structures in the colour of the best one.
+def _likeliest_colour(context: FitContext, simulated: list[Candidate]) -> list[Candidate]:
+    """Return structures in the likeliest colour of the best one, the best first.
 
     The colour is found from two starts: the residual of the best simulation, and a slow
-    disturbance, which a simulation would follow.
+    disturbance, which a simulation would follow. It counts where its best model simulates the
+    record about as well as the best simulation of all does.
 
     :param simulated: fitted to the measurement itself.
     """
     simulated = sorted(simulated, key=lambda c: c.score)
     if not simulated or simulated[0].state.cost <= context.floor:
-        return _Reached(simulated, [])
+        return simulated
     own = _colour(simulated[0].problem, simulated[0].state)
     if own is None:
-        return _Reached(simulated, [])
+        return simulated
     slow = slow_colour(1.0 - _SLOWEST / context.problem.time.size)
-    ends = [_converged(_in(colour, simulated, context), context) for colour in (own, slow)]
-    return _Reached(simulated, [end for end in ends if end])
-
-
-def _best_of_all(reached: list[_Reached]) -> list[Candidate]:
-    """Return the structures, terms and colour that are the most likely, the best first.
-
-    A colour counts where its best model simulates the record about as well as the best
-    simulation of all does.
-    """
-    least = min(
-        (c.state.cost / c.problem.time.size for each in reached for c in each.simulated),
-        default=math.inf,
-    )
-    ends = []
-    for each in reached:
-        likely = [end for end in each.coloured if _simulates(end[0], least)]
-        ends += likely or [each.simulated]
-    return min(ends, key=lambda f: f[0].score if f else math.inf)
+    ends = (_converged(_in(colour, simulated, context), context) for colour in (own, slow))
+    least = min(c.state.cost / c.problem.time.size for c in simulated)
+    likely = [end for end in ends if end and _simulates(end[0], least)]
+    return min(likely, key=lambda end: end[0].score, default=simulated)
 
 
 def _converged(found: list[Candidate], context: FitContext) -> list[Candidate]:
