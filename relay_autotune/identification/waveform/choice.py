@@ -298,11 +298,12 @@ def _with_a_load(
         each
         for without in (*simple, *([] if best is None else [best]))
         for each in context.with_terms(without, ("load",))
-        if _colour(each.problem, each.state) is None
     ]
     if not loaded:
         return []
-    decided = min(loaded, key=lambda c: c.score)
+    decided = _with_best_terms(context, loaded)
+    if _colour(decided.problem, decided.state) is not None:
+        return []
     again = _beside_terms(context, known, names, decided, loaded)
     if not again or again[0].problem.colour is not None or again[0].score >= found[0].score:
         return []
