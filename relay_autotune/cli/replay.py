@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -261,22 +262,22 @@ def _into_file(jobs: Sequence[Job], options: argparse.Namespace) -> int:
 
 def _in_order(jobs: Sequence[Job], options: argparse.Namespace) -> Iterator[Done]:
     """Yield results in the order of the command line."""
-    if options.jobs > 1 or options.scheduler:
-        early: dict[int, Done] = {}
-        due = 0
-        for number, done in _as_they_come(jobs, options):
-            early[number] = done
-            while due in early:
-                yield early.pop(due)
-                due += 1
-        return
-    for job in jobs:
-        with Working(f"reading {job.name}", patient=True) as working:
-            found = replay(job, working)
-        yield found
+    early: dict[int, Done] = {}
+    due = 0
+    for number, done in _as_they_come(jobs, options, alone=True):
+        early[number] = done
+        while due in early:
+            yield early.pop(due)
+            due += 1
 
 
-def _as_they_come(jobs: Sequence[Job], options: argparse.Namespace) -> Iterator[tuple[int, Done]]:
+def _as_they_come(
+    jobs: Sequence[Job], options: argparse.Namespace, *, alone: bool = False
+) -> Iterator[tuple[int, Done]]:
+    """Yield the number of each job and its result.
+
+    :param alone: whether each job says itself what it is at, unless several run at a time.
+    """
     if options.scheduler:
         from relay_autotune.cli.fleet import on_cluster
 
@@ -287,7 +288,10 @@ def _as_they_come(jobs: Sequence[Job], options: argparse.Namespace) -> Iterator[
         yield from in_processes(jobs, options.jobs)
     else:
         for number, job in enumerate(jobs):
-            yield number, replay(job)
+            shown = Working(f"reading {job.name}", patient=True) if alone else nullcontext()
+            with shown as working:
+                found = replay(job, working)
+            yield number, found
 
 
 def _tell(done: Done) -> None:
