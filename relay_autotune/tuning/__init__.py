@@ -17,7 +17,6 @@ from relay_autotune.loop.gains import Controller, Gains, Performance
 from relay_autotune.loop.laws import OWN_LAW
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.process.ultimate import UltimatePoint
 from relay_autotune.tuning.ensemble import ensemble_ms
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.rules import PUBLISHED, Rule
@@ -41,9 +40,7 @@ def tune(
     identification: Identification | TransferFunction,
     rule: str = DEFAULT_RULE,
     models: Sequence[TransferFunction] = (),
-    simple: TransferFunction | None = None,
     options: DesignOptions | None = None,
-    describing: UltimatePoint | None = None,
 ) -> Gains:
     """Return the gains of a rule, judged on the model and on models within its uncertainty.
 
@@ -60,24 +57,15 @@ def tune(
     :param identification: the model, as it was identified, or a transfer function.
     :param rule: one of ``RULES``.
     :param models: models within the uncertainty, from :func:`ensemble`.
-    :param simple: the FOPDT that fits best; a rule for FOPDT designs on it if the model has
-        another structure. The gains are still judged on the model.
     :param options: what is asked of the controller.
-    :param describing: K_u and w_u by the describing function from the limit cycle.
     :raises TuningError: if the rule does not apply, or its loop is unstable on the model or on
         more than 5 % of ``models``.
     """
     if isinstance(identification, TransferFunction):
-        task = task_of_model(identification, options)
+        model = identification
     else:
-        task = DesignTask(model=identification.model, options=options or DesignOptions())
-    task = replace(
-        task,
-        simple=simple or task.simple,
-        models=tuple(models),
-        describing=describing or task.describing,
-    )
-    return design(task, rule)
+        model = identification.model
+    return design(replace(task_of_model(model, options), models=tuple(models)), rule)
 
 
 def task_of_model(model: TransferFunction, options: DesignOptions | None = None) -> DesignTask:

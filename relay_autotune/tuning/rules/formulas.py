@@ -323,7 +323,7 @@ def itae(task: DesignTask) -> tuple[Controller, str]:
     return gains, f"minimum ITAE (Rovira) for D/tau = {ratio:.3g}{process.note}"
 
 
-def imc(task: DesignTask) -> tuple[Controller, str]:
+def imc(task: DesignTask, name: str = "imc") -> tuple[Controller, str]:
     """Return the gains of internal model control, with lambda free.
 
     PI: ``kc = (tau + D/2)/(K lambda)``, ``ti = tau + D/2``, by default
@@ -332,38 +332,26 @@ def imc(task: DesignTask) -> tuple[Controller, str]:
     ti, ``td = tau D/(2 tau + D)``, by default ``lambda = max(0.8 D, 0.2 tau)``. Source: Rivera,
     Morari and Skogestad, Ind. Eng. Chem. Process Des. Dev. 25, 1986.
 
-    :param task: a stable FOPDT process; its ``closed_loop_time`` is lambda.
-    :raises TuningError: for any other.
-    """
-    process = fopdt_of("imc", task)
-    share = 0.8 if wants_pid("imc", task) else 1.7
-    closed, given = task.options.closed_loop(max(share * process.delay, 0.2 * process.lag))
-    return _imc("imc", task, process, closed, f"lambda = {closed:.4g} s{given}")
-
-
-def imc_chang(task: DesignTask) -> tuple[Controller, str]:
-    """Return the gains of internal model control with the process's own time constant as lambda.
-
     Chang, Shen and Yu (1992, Fig 5) ask of 1.65 exp(-10 s)/(20 s + 1) a closed loop with a time
-    constant of 20 s, that of the process.
+    constant of 20 s, that of the process: so does ``imc_chang``.
 
-    :param task: a stable FOPDT process.
+    :param task: a stable FOPDT process; its ``closed_loop_time`` is lambda.
+    :param name: of the rule.
     :raises TuningError: for any other.
     """
-    process = fopdt_of("imc_chang", task)
-    why = f"lambda = tau = {process.lag:.4g} s (Chang, Shen and Yu)"
-    return _imc("imc_chang", task, process, process.lag, why)
-
-
-def _imc(
-    name: str, task: DesignTask, process: Reduced, closed: float, why: str
-) -> tuple[Controller, str]:
+    process, pid = fopdt_of(name, task), wants_pid(name, task)
     tau, half = process.lag, 0.5 * process.delay
+    closed, given = task.options.closed_loop(max((0.8 if pid else 1.7) * process.delay, 0.2 * tau))
+    why = f"lambda = {closed:.4g} s{given}"
+    if name == "imc_chang":
+        closed, why = tau, f"lambda = tau = {tau:.4g} s (Chang, Shen and Yu)"
     ti, td = tau + half, 0.0
-    if wants_pid(name, task):
+    if pid:
         closed, td = closed + half, tau * half / (tau + half)
     return controller(task, ti / (process.gain * closed), ti, td), f"IMC with {why}{process.note}"
 
+
+imc_chang = partial(imc, name="imc_chang")
 
 RELAXED = 1.15
 
