@@ -78,7 +78,13 @@ class Reason:
 
     def __str__(self) -> str:
         """Return the sentence for people, the notes behind it."""
-        return self.said or "; ".join((self.code.sentence(self.values), *map(str, self.notes)))
+        if self.said:
+            return self.said
+        row = self.code.row
+        told, remedy, place = (_filled(t, self.values) for t in (row.found, row.remedy, _PLACE))
+        if remedy:
+            told += f"{'; ' if ': ' in told else ': '}{remedy}"
+        return "; ".join((told + place, *map(str, self.notes)))
 
 
 # Parts of several sentences.
@@ -105,7 +111,7 @@ _MOVED_BY = (
     "{amplitude:.3g} u, or wider limits if the plant allows]"
 )
 # Where a running experiment was when something from outside ended it.
-_PLACE = " (at {ended_at:.6g} s, {where})"
+_PLACE = "[ (at {ended_at:.6g} s, {where})]"
 _OPTIONAL = re.compile(r"\[(.*?)\]")
 
 
@@ -185,16 +191,6 @@ class Code(enum.IntEnum):
         if missing:
             raise TypeError(f"{self.name} needs {', '.join(sorted(missing))}")
         return Reason(self, tuple(values.items()), notes)
-
-    def sentence(self, values: Mapping[str, Value]) -> str:
-        """Return what was found, and what to do, for people.
-
-        :param values: by name.
-        """
-        told, remedy = _filled(self.row.found, values), _filled(self.row.remedy, values)
-        if remedy:
-            told += f"{'; ' if ': ' in told else ': '}{remedy}"
-        return told + (_filled(_PLACE, values) if "ended_at" in values else "")
 
     NONE = _Row(0, "")
     OTHER = _Row(1, "{sentence}")

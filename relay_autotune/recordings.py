@@ -143,16 +143,12 @@ DEFAULTS: dict[str, dict[str, Any]] = {
 def _of_topics(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]]:
     if not topics.types():
         raise BagError("; ".join((f"{topics.path} holds no topic", *topics.notes)))
-    if wanted.joint or wanted.measurement is not None or wanted.command is not None:
-        records, notes = _of_pair(topics, wanted)
-    else:
+    records, notes = list[Record](), list[str]()
+    if not (wanted.joint or wanted.measurement is not None or wanted.command is not None):
         records, notes = recorded_experiments(topics)
-        if not records:
-            interrupted = interrupted_experiment(topics)
-            if interrupted is not None:
-                records = [interrupted]
-            else:
-                records, notes = _of_pair(topics, wanted)
+        records = records or interrupted_experiment(topics)
+    if not records:
+        records, notes = _of_pair(topics, wanted)
     return records, [*topics.notes, *notes]
 
 
@@ -326,17 +322,17 @@ def recorded_experiments(topics: Topics) -> tuple[list[Record], list[str]]:
     return list(records.values()), refused
 
 
-def interrupted_experiment(topics: Topics) -> Record | None:
+def interrupted_experiment(topics: Topics) -> list[Record]:
     """Return the experiment that was being recorded when relay_node was killed.
 
     :param topics: the bag; one that relay_node wrote says which topics are the loop's.
-    :return: None if the bag is not one of relay_node.
+    :return: none if the bag is not one of relay_node.
     :raises BagError: if it ends before the first sample was answered.
     """
     for about in topics.metadata(EXPERIMENT_METADATA):
         if {"measurement", "command", "experiment_id"} <= about.keys():
-            return _rebuilt(topics, about)
-    return None
+            return [_rebuilt(topics, about)]
+    return []
 
 
 def _rebuilt(topics: Topics, about: Mapping[str, str]) -> Record:

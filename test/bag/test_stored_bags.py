@@ -98,7 +98,7 @@ def test_the_samples_alone_tell_the_experiment(name):
     expected = the_record(name)
     (path,) = (BAGS / name).glob("*.mcap")
     with McapFile(path) as file:
-        found = interrupted_experiment(Topics(BAGS / name, [file]))
+        (found,) = interrupted_experiment(Topics(BAGS / name, [file]))
     assert_same_record(found, expected, stamps=1e-12)
     assert found.settings == expected.settings
     assert found.cycle_start == expected.cycle_start
