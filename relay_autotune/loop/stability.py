@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from relay_autotune.arrays import ComplexArray, FloatArray, IntArray
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.gains import Margins
-from relay_autotune.process.frequencies import PER_DECADE, frequencies
+from relay_autotune.process.frequencies import frequencies
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.scalar import roots
 
@@ -95,14 +95,12 @@ def closed_loop_unstable_poles(terms: Sequence[TransferFunction]) -> float:
         high = 2.0 * high
         if high[0] > 1.0 / _LOWEST:
             return math.inf
-    ends = [
-        np.geomspace(x, y, 2 + int(PER_DECADE * math.log10(y / x)))
-        for x, y in ((low[0], grid[0]), (grid[-1], high[0]))
-    ]
-    grid = np.unique(np.concatenate((grid, *ends)))
+    grid = frequencies(*terms, times=(1.0 / low[0], 1.0 / high[0]))
     dead_time = max(t.dead_time for t in terms)
     turns = _followed(bounded, grid, dead_time, is_near)
-    turns += float(np.angle(bounded(low)[0] / begin) - np.angle(bounded(high)[0] / limit))
+    turns += float(
+        np.angle(bounded(grid[:1])[0] / begin) - np.angle(bounded(grid[-1:])[0] / limit)
+    )
     return math.inf if math.isnan(turns) else poles - round(turns / math.pi)
 
 

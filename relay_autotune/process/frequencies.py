@@ -15,7 +15,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 
 # Below this magnitude a loop has no influence.
 _RELEVANT = 0.05
-PER_DECADE = 50
+_PER_DECADE = 50
 # Distance of a sampled loop's grid from half the sampling frequency, relative to it.
 _BEFORE_END = 1e-9
 _MOST_TURNS = 800.0 * math.pi
@@ -44,7 +44,7 @@ def frequencies(
     top = math.pi / period if period > 0.0 else 1e2 * max(corners)
     low = math.floor(math.log10(1e-3 * min(top, *corners)))
     high = math.ceil(math.log10(top))
-    grid = 10.0 ** (np.arange(low * PER_DECADE, high * PER_DECADE + 1) / PER_DECADE)
+    grid = 10.0 ** (np.arange(low * _PER_DECADE, high * _PER_DECADE + 1) / _PER_DECADE)
     grid = grid[grid <= top]
     parts = [grid]
     if period > 0.0:
