@@ -196,7 +196,7 @@ class ServedNode(Node):
         callbacks do in between, such as that of /clock."""
         self._when_idle: deque[Callable[[], object]] = deque()
 
-    def get_logger(self) -> Any:
+    def get_logger(self) -> _Log:
         """Return the log, in which text of other nodes is made visible."""
         return _Log(super().get_logger())
 
