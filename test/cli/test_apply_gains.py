@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import signal
 import sys
@@ -30,7 +29,6 @@ from relay_autotune.loop.analysis import performance_beside
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes.gains_client import StepsHere
-from relay_autotune.nodes.verifier import without_arrays
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code
 from relay_autotune.record.record import Record, RelaySettings
@@ -157,14 +155,6 @@ def test_a_verdict_that_failed_says_why_and_which_gains_are_back() -> None:
     assert "failed: it settles later" in text
     assert "kc 0.1000" in text and "--revert" not in text
     assert "the command is held" in "\n".join(laid_out(verdict_entries(failed, None), 60))
-
-
-def test_the_result_of_a_step_carries_no_samples() -> None:
-    whole = step(ms=math.inf)
-    summary = without_arrays(whole)
-    assert not (summary.time or summary.measurement or summary.command or summary.predicted)
-    assert (summary.kind, summary.step, summary.ms) == (whole.kind, whole.step, whole.ms)
-    assert (summary.reason, summary.passed) == (whole.reason, True)
 
 
 @dataclass(frozen=True)

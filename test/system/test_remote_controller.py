@@ -31,6 +31,8 @@ def test_the_gains_of_another_node_are_proved_or_taken_back(rig: Rig) -> None:
     assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
     assert result.passed, result.reason
     (step,) = result.steps
+    # Its samples are on the topic.
+    assert not (step.time or step.measurement or step.command or step.predicted)
     assert step.gain_ratio == pytest.approx(1.0, abs=0.2)
     loop.until_setpoints(5.0, 5.5, 5.0)
     assert loop.values() == [0.5, 1.6, 0.0]
