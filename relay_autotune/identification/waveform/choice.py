@@ -301,7 +301,7 @@ def _with_a_load(
     ]
     if not loaded:
         return []
-    decided = _with_best_terms(context, loaded)
+    decided = _with_best_terms(context, [min(loaded, key=lambda c: c.score)])
     if _colour(decided.problem, decided.state) is not None:
         return []
     again = _beside_terms(context, known, names, decided, loaded)
@@ -333,27 +333,23 @@ def _beside_terms(
 def _with_best_terms(context: FitContext, simple: Sequence[Candidate]) -> Candidate:
     """Return the best of some candidates with the terms beside the model that improve its score.
 
-    They are added one after the other, each time the one that improves the score most in the
-    colour of its own residual: where a structure is too simple, the colour explains what a term
-    would.
+    To each they are added one after the other, each time the one that improves the score most in
+    the colour of its own residual: where a structure is too simple, the colour explains what a
+    term would.
 
     :param simple: in white noise, at least one.
     """
-    best, now = _best_in_own_colour(context, simple)
-    while more := context.with_one_more_term(now):
-        coloured, plain = _best_in_own_colour(context, more)
-        if coloured.score >= best.score:
-            break
-        now, best = plain, coloured
-    return now
-
-
-def _best_in_own_colour(
-    context: FitContext, found: Sequence[Candidate]
-) -> tuple[Candidate, Candidate]:
-    """Return the best of some candidates, in the colour of its residual and as it was."""
-    pairs = ((_in_own_colour(context, c), c) for c in found)
-    return min(pairs, key=lambda pair: pair[0].score)
+    reached = []
+    for now in simple:
+        best = _in_own_colour(context, now)
+        while more := context.with_one_more_term(now):
+            pairs = [(_in_own_colour(context, c), c) for c in more]
+            coloured, plain = min(pairs, key=lambda pair: pair[0].score)
+            if coloured.score >= best.score:
+                break
+            now, best = plain, coloured
+        reached.append((best, now))
+    return min(reached, key=lambda pair: pair[0].score)[1]
 
 
 def _in_own_colour(context: FitContext, candidate: Candidate) -> Candidate:
