@@ -13,6 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+import numpy as np
+
 from relay_autotune.arrays import FloatArray
 from relay_autotune.reasons import Code, Reason, Value
 from relay_autotune.record.record import Cycle, RelaySettings
@@ -344,8 +346,9 @@ def why_no_return(
     :param noise_std: standard deviation of the noise [y].
     :param facts: for the sentence of the reason.
     """
-    thirds = [part for part in _thirds(time, towards) if len(part)]
-    if len(thirds) < 3:
+    edges = time[0] + (time[-1] - time[0]) * np.array([1.0, 2.0]) / 3.0
+    thirds = np.split(towards, np.searchsorted(time, edges))
+    if min(map(len, thirds)) == 0:
         return Code.TOO_FEW_SAMPLES(**facts)
     first, second, third = (float(part.mean()) for part in thirds)
     whole = float(towards.max() - towards.min())
@@ -360,21 +363,6 @@ def why_no_return(
         rests = abs(third - second) <= level
         return (Code.MOVED_AWAY_LOAD if rests else Code.MOVED_AWAY_UNSTABLE)(**facts)
     return (Code.SATURATED if abs(third - second) <= level else Code.TOO_SLOW)(**facts)
-
-
-def has_moved(measurement: FloatArray) -> bool:
-    """Return True if a measurement has changed at all, or has too few samples to decide.
-
-    :param measurement: the samples since the command last changed [y], shape (n,).
-    """
-    return len(measurement) < _SAMPLES or bool(measurement.max() > measurement.min())
-
-
-def _thirds(time: FloatArray, values: FloatArray) -> list[FloatArray]:
-    begin, span = float(time[0]), float(time[-1] - time[0])
-    edges = [begin + k * span / 3.0 for k in (1, 2)]
-    early, late = time < edges[0], time >= edges[1]
-    return [values[early], values[~early & ~late], values[late]]
 
 
 def is_growing(swings: Sequence[float]) -> bool:

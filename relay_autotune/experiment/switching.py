@@ -19,7 +19,6 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.experiment.faults import (
     TELL,
     RunawayWatch,
-    has_moved,
     is_growing,
     why_no_return,
     why_noise_alone,
@@ -83,6 +82,9 @@ _CLEARLY = 5.0
 
 # A measurement that did not move for this many stays of the relay does not follow it.
 _STAYS = 2
+
+# Fewer samples do not show whether it has moved at all.
+_SHOWS = 10
 
 # Whether it rests within the band is looked at after this many times the time to respond: by then
 # it has moved for as long as that, if it moves at all.
@@ -419,8 +421,9 @@ class Switching:
         return failed(self._why_lost(t, y))
 
     def _has_moved(self) -> bool:
-        """Return True if the measurement has moved since the command last changed."""
-        return has_moved(self._since(max(self._course.relay.since, self._load.at))[1])
+        """Return True unless the measurement stands still since the command last changed."""
+        _, y = self._since(max(self._course.relay.since, self._load.at))
+        return len(y) < _SHOWS or bool(y.max() > y.min())
 
     def _since(self, time: float) -> tuple[FloatArray, FloatArray]:
         """Return time and measurement since an instant."""

@@ -247,8 +247,6 @@ class Readiness:
         else:
             parameters.validate()
             baseline = _baseline_from(values["baseline"], self._loop.mean_command(), held)
-            if why := parameters.why_one_way(baseline):
-                raise NotReadyError(why)
         parameters.validate(baseline)
         policy = _policy_from(values, connected=self._loop.is_connected)
         # A feedback of the position, or the controller of a closed loop, also shows where the
