@@ -18,6 +18,7 @@ from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
 from relay_autotune.control.controller import Control
+from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.step_choice import StepChoice, StepRange
 from relay_autotune.control.verification import SETTLES, noise_of
 from relay_autotune.errors import LoopError
@@ -47,8 +48,6 @@ _RESULT_WITHIN = 5.0
 _TURN = 0.1
 # Limits that relay_node and controller_node both have.
 LIMITS = ("measurement_min", "measurement_max", "command_min", "command_max")
-# Relative difference of equal gains, since another node may round them.
-_SAME = 1e-9
 
 
 class GainsClient(LoopClient):
@@ -141,11 +140,7 @@ class GainsClient(LoopClient):
 
     def in_force(self) -> Controller | None:
         """Return the gains in force, also where another node has them; None: there are none."""
-        target, places = self._there()
-        if target:
-            return gains_at(self, target, places)
-        found = self.values(self.name, [entry.name for entry in GAINS])
-        return Controller(**found) if found["kc"] else None
+        return gains_at(self, *self._there())
 
     def ask(self, service: str, done: Callable[[], str] = lambda: "") -> str:
         """Call ~/apply, ~/revert or ~/discard, and return its answer.
@@ -171,12 +166,9 @@ class GainsClient(LoopClient):
 
         :param gains: the gains; of another node's only those parts count that it is known to have.
         """
-        present = self.in_force()
-        others = () if self.values(self.name, ["apply_to"])["apply_to"] else ("tf", "b")
-        return present is not None and all(
-            math.isclose(getattr(present, name), getattr(gains, name), rel_tol=_SAME)
-            for name in ("kc", "ti", "td", *others)
-        )
+        node, places = self._there()
+        wanted = {place: getattr(gains, name) for name, place in places.items()}
+        return GainSet.of(self.values(node, list(wanted))).is_near(GainSet.of(wanted))
 
     @contextmanager
     def offered(self, message: Any) -> Iterator[Gains]:
@@ -279,7 +271,7 @@ class GainsClient(LoopClient):
         before = self.values(self.name, ("verify_step", "verify_step_max"))
         more = abs(setpoint) > max(map(abs, before.values()))
         target, places = self._there()
-        there = self.values(target, list(places.values())) if target else {}
+        there = self.values(target, list(places.values()))
         goal = Verify.Goal(setpoint_step=setpoint, load_step=load, patience=patience)
         if more:
             self.set_values(self.name, {"verify_step_max": abs(setpoint)})
@@ -296,20 +288,21 @@ class GainsClient(LoopClient):
         return result
 
     def _there(self) -> tuple[str, dict[str, str]]:
-        """Return the other node that has the gains, empty: none, and its parameter for each."""
+        """Return the node that has the gains, and its parameter for each."""
         names = ("apply_to", "apply_parameters")
         target, mapping = self.values(self.name, names).values()
-        return target, mapping_of(mapping) if target else {}
+        own = {entry.name: entry.name for entry in GAINS}
+        return (target, mapping_of(mapping)) if target else (self.name, own)
 
     def _taken_back(self, target: str, before: dict[str, float]) -> str:
         """Bring back the gains of another node, whose controller_node is gone, and say so.
 
-        :param target: the other node; empty: there is none.
+        :param target: the other node; the controller_node itself: there is none.
         :param before: its parameters.
         """
         # Who is lost is no reason any longer to leave the rest undone.
         self.why_lost = lambda: ""
-        if not target:
+        if target == self.name:
             return (
                 "nobody controls the loop; started again, it begins with the gains that were "
                 "proven, or with those of its parameters"
