@@ -10,7 +10,6 @@ is opened late or loaded again shows all. Without any page nothing waits and not
 from __future__ import annotations
 
 import math
-import queue
 import threading
 import time
 from collections import deque
@@ -156,7 +155,7 @@ class Live:
         self._is_new = True
         self._signals = {"measurement": _Signal(), "command": _Signal()}
         self._begun = time.monotonic()
-        self._wishes: queue.SimpleQueue[PageCommand] = queue.SimpleQueue()
+        self._wishes: deque[PageCommand] = deque()
         self._shown: dict[str, Any] = {}
         self._shown_anew: set[str] = set()
         self.abort = threading.Event()
@@ -225,26 +224,22 @@ class Live:
         if wish.what == ABORT:
             self.abort.set()
         elif phase == "idle" or (phase == "checking" and not wish.dry):
-            self._wishes.put(wish)
+            self._wishes.append(wish)
 
     def next_wish(self) -> PageCommand | None:
         """Return the next wish; None: there is none."""
-        try:
-            return self._wishes.get_nowait()
-        except queue.Empty:
-            return None
+        return self._wishes.popleft() if self._wishes else None
 
     def forget_wishes(self) -> None:
         """Drop what was wished before a tune began or ended, such as by a second click."""
-        while self.next_wish():
-            pass
+        self._wishes.clear()
         self.abort.clear()
 
     def forget_questions(self) -> None:
         """Drop what was only asked while a plan was looked at, which its page asks again."""
         for wish in list(iter(self.next_wish, None)):
             if not wish.dry:
-                self._wishes.put(wish)
+                self._wishes.append(wish)
         self.abort.clear()
 
     def everything(self) -> dict[str, Any]:

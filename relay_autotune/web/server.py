@@ -572,10 +572,8 @@ def run(page: Page, tell: Callable[[str], None]) -> None:
     :param tell: called with the address to open.
     :raises SelectionError: if the address cannot be used.
     """
-    try:
+    with suppress(KeyboardInterrupt):
         asyncio.run(serve(page, tell))
-    except KeyboardInterrupt:
-        return
 
 
 @contextmanager
