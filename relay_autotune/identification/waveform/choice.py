@@ -266,7 +266,7 @@ def _compared(context: FitContext, known: Known, among: Sequence[str] = TRIED) -
     simple = context.fit(first, known.order)
     if not simple:
         return []
-    decided = _with_best_terms(context, simple)
+    decided = _best_by_own_colour(context, [_with_best_terms(context, c) for c in simple])
     found = _beside_terms(context, known, names, decided, simple)
     if context.loads or len(context.problem.bounds) > 1:
         return found
@@ -301,7 +301,7 @@ def _with_a_load(
     ]
     if not loaded:
         return []
-    decided = _with_best_terms(context, [min(loaded, key=lambda c: c.score)])
+    decided = _with_best_terms(context, min(loaded, key=lambda c: c.score))
     if _colour(decided.problem, decided.state) is not None:
         return []
     again = _beside_terms(context, known, names, decided, loaded)
@@ -330,26 +330,31 @@ def _beside_terms(
     return _likeliest_colour(inside, inside.fit(some, known.order, (*ready, decided)))
 
 
-def _with_best_terms(context: FitContext, simple: Sequence[Candidate]) -> Candidate:
-    """Return the best of some candidates with the terms beside the model that improve its score.
+def _with_best_terms(context: FitContext, candidate: Candidate) -> Candidate:
+    """Return a candidate with the terms beside the model that improve its score.
 
-    To each they are added one after the other, each time the one that improves the score most in
-    the colour of its own residual: where a structure is too simple, the colour explains what a
-    term would.
+    They are added one after the other, each time the one that improves the score most.
 
-    :param simple: in white noise, at least one.
+    :param candidate: in white noise.
     """
-    reached = []
-    for now in simple:
-        best = _in_own_colour(context, now)
-        while more := context.with_one_more_term(now):
-            pairs = [(_in_own_colour(context, c), c) for c in more]
-            coloured, plain = min(pairs, key=lambda pair: pair[0].score)
-            if coloured.score >= best.score:
-                break
-            now, best = plain, coloured
-        reached.append((best, now))
-    return min(reached, key=lambda pair: pair[0].score)[1]
+    best = _best_by_own_colour(context, [candidate, *context.with_one_more_term(candidate)])
+    return candidate if best is candidate else _with_best_terms(context, best)
+
+
+def _best_by_own_colour(context: FitContext, found: Sequence[Candidate]) -> Candidate:
+    """Return the candidate that is the best one in the colour of its residual.
+
+    Where a structure is too simple, the colour explains what a term would: it counts only for one
+    that simulates the record about as well as the best of them.
+
+    :param found: in white noise, at least one.
+    """
+    left = [c.state.cost / c.problem.time.size for c in found]
+    scores = [
+        (_in_own_colour(context, c) if each <= _WORSE * min(left) else c).score
+        for c, each in zip(found, left, strict=True)
+    ]
+    return found[int(np.argmin(scores))]
 
 
 def _in_own_colour(context: FitContext, candidate: Candidate) -> Candidate:
