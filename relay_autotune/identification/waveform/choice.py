@@ -267,7 +267,7 @@ def _compared(context: FitContext, known: Known, among: Sequence[str] = TRIED) -
     if not simple:
         return []
     decided = _best_by_own_colour(context, [_with_best_terms(context, c) for c in simple])
-    found = _beside_terms(context, known, names, decided, simple)
+    found = _with_terms(context, known, names, decided, simple)
     if context.loads or len(context.problem.bounds) > 1:
         return found
     if not found or found[0].problem.colour is None:
@@ -304,10 +304,32 @@ def _with_a_load(
     decided = _with_best_terms(context, min(loaded, key=lambda c: c.score))
     if _colour(decided.problem, decided.state) is not None:
         return []
-    again = _beside_terms(context, known, names, decided, loaded)
+    again = _with_terms(context, known, names, decided, loaded)
     if not again or again[0].problem.colour is not None or again[0].score >= found[0].score:
         return []
     return again if ljung_box(again[0].state.residual) >= _CHANCE else []
+
+
+def _with_terms(
+    context: FitContext,
+    known: Known,
+    names: Sequence[str],
+    decided: Candidate,
+    ready: Sequence[Candidate],
+) -> list[Candidate]:
+    """Return structures with the terms of one candidate and those that the best one needs, too.
+
+    The best structure of all may need others than a simple one; parameters as of `_beside_terms`.
+    """
+    found = _beside_terms(context, known, names, decided, ready)
+    white = context.refit(found[0], None) if found and not known.structure else None
+    if white is None:
+        return found
+    again = _with_best_terms(context, white)
+    if again is white:
+        return found
+    other = _with_terms(context, known, names, again, ready)
+    return min(other or found, found, key=lambda each: each[0].score)
 
 
 def _beside_terms(
@@ -344,17 +366,11 @@ def _with_best_terms(context: FitContext, candidate: Candidate) -> Candidate:
 def _best_by_own_colour(context: FitContext, found: Sequence[Candidate]) -> Candidate:
     """Return the candidate that is the best one in the colour of its residual.
 
-    Where a structure is too simple, the colour explains what a term would: it counts only for one
-    that simulates the record about as well as the best of them.
+    Where a structure is too simple, the colour explains what a term would.
 
     :param found: in white noise, at least one.
     """
-    left = [c.state.cost / c.problem.time.size for c in found]
-    scores = [
-        (_in_own_colour(context, c) if each <= _WORSE * min(left) else c).score
-        for c, each in zip(found, left, strict=True)
-    ]
-    return found[int(np.argmin(scores))]
+    return min(found, key=lambda candidate: _in_own_colour(context, candidate).score)
 
 
 def _in_own_colour(context: FitContext, candidate: Candidate) -> Candidate:
