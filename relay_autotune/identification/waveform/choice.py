@@ -15,6 +15,7 @@ import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from operator import itemgetter
 
 import numpy as np
 
@@ -266,23 +267,23 @@ def _compared(context: FitContext, known: Known, among: Sequence[str] = TRIED) -
     simple = context.fit(first, known.order)
     if not simple:
         return []
-    decided = _best_by_own_colour(context, [_with_best_terms(context, c) for c in simple])
+    decided = _with_best_terms(context, simple)
     found = _with_terms(context, known, names, decided, simple)
-    if context.loads or len(context.problem.bounds) > 1:
-        return found
     if not found or found[0].problem.colour is None:
         return found
-    return _with_a_load(replace(context, loads=True), known, names, found, simple) or found
+    if context.loads or len(context.problem.bounds) > 1:
+        return found
+    return _with_a_load(replace(context, loads=True), known, names, found, simple)
 
 
 def _with_a_load(
     context: FitContext,
     known: Known,
     names: Sequence[str],
-    found: Sequence[Candidate],
+    found: list[Candidate],
     simple: Sequence[Candidate],
 ) -> list[Candidate]:
-    """Return structures beside a step of the load, the best first; none where that explains less.
+    """Return structures beside a step of the load, those without one where that explains less.
 
     Where no relay held the process, a load counts only if white noise is all that is left:
     between a few steps, a slow disturbance looks like a load as well.
@@ -300,14 +301,14 @@ def _with_a_load(
         for each in context.with_terms(without, ("load",))
     ]
     if not loaded:
-        return []
-    decided = _with_best_terms(context, min(loaded, key=lambda c: c.score))
+        return found
+    decided = _with_best_terms(context, [min(loaded, key=lambda c: c.score)])
     if _colour(decided.problem, decided.state) is not None:
-        return []
+        return found
     again = _with_terms(context, known, names, decided, loaded)
     if not again or again[0].problem.colour is not None or again[0].score >= found[0].score:
-        return []
-    return again if ljung_box(again[0].state.residual) >= _CHANCE else []
+        return found
+    return again if ljung_box(again[0].state.residual) >= _CHANCE else found
 
 
 def _with_terms(
@@ -317,29 +318,9 @@ def _with_terms(
     decided: Candidate,
     ready: Sequence[Candidate],
 ) -> list[Candidate]:
-    """Return structures with the terms of one candidate and those that the best one needs, too.
-
-    The best structure of all may need others than a simple one; parameters as of `_beside_terms`.
-    """
-    found = _beside_terms(context, known, names, decided, ready)
-    white = context.refit(found[0], None) if found and not known.structure else None
-    if white is None:
-        return found
-    again = _with_best_terms(context, white)
-    if again is white:
-        return found
-    other = _with_terms(context, known, names, again, ready)
-    return min(other or found, found, key=lambda each: each[0].score)
-
-
-def _beside_terms(
-    context: FitContext,
-    known: Known,
-    names: Sequence[str],
-    decided: Candidate,
-    ready: Sequence[Candidate],
-) -> list[Candidate]:
     """Return structures with the terms of one candidate, in the likeliest colour, the best first.
+
+    The best structure of all may need further terms than a simple one.
 
     :param context: the samples, and the terms that may be estimated.
     :param known: the structure, if it is known.
@@ -349,28 +330,40 @@ def _beside_terms(
     """
     some = [n for n in names if TABLE[n].integrators or not decided.problem.friction]
     inside = context.with_nuisances_of(decided)
-    return _likeliest_colour(inside, inside.fit(some, known.order, (*ready, decided)))
+    found = _likeliest_colour(inside, inside.fit(some, known.order, (*ready, decided)))
+    white = context.refit(found[0], None) if found and not known.structure else None
+    if white is None:
+        return found
+    again = _with_best_terms(context, [white])
+    if again is white:
+        return found
+    other = _with_terms(context, known, names, again, ready)
+    return min(other or found, found, key=lambda each: each[0].score)
 
 
-def _with_best_terms(context: FitContext, candidate: Candidate) -> Candidate:
-    """Return a candidate with the terms beside the model that improve its score.
+def _with_best_terms(context: FitContext, found: Sequence[Candidate]) -> Candidate:
+    """Return the best of some candidates with the terms beside the model that improve its score.
 
-    They are added one after the other, each time the one that improves the score most.
-
-    :param candidate: in white noise.
-    """
-    best = _best_by_own_colour(context, [candidate, *context.with_one_more_term(candidate)])
-    return candidate if best is candidate else _with_best_terms(context, best)
-
-
-def _best_by_own_colour(context: FitContext, found: Sequence[Candidate]) -> Candidate:
-    """Return the candidate that is the best one in the colour of its residual.
-
-    Where a structure is too simple, the colour explains what a term would.
+    To each they are added one after the other, each time the one that improves the score most.
+    Each score is in the colour of its own residual: where a structure is too simple, the colour
+    explains what a term would.
 
     :param found: in white noise, at least one.
     """
-    return min(found, key=lambda candidate: _in_own_colour(context, candidate).score)
+
+    def by_own_colour(some: Sequence[Candidate]) -> list[tuple[float, Candidate]]:
+        return [(_in_own_colour(context, c).score, c) for c in some]
+
+    reached = []
+    for now in by_own_colour(found):
+        best = now
+        while more := by_own_colour(context.with_one_more_term(best[1])):
+            better = min(more, key=itemgetter(0))
+            if better[0] >= best[0]:
+                break
+            best = better
+        reached.append(best)
+    return min(reached, key=itemgetter(0))[1]
 
 
 def _in_own_colour(context: FitContext, candidate: Candidate) -> Candidate:
