@@ -179,14 +179,12 @@ class GainsPage:
         :param wish: to apply, prove, verify or revert.
         """
         live = self.live
-        live.forget_wishes()
         try:
             self._do(wish)
         except RelayAutotuneError as error:
             live.rest(str(error), good=False)
         if live.told.window[1:] == (0.0,):
             live.tell(window=(live.told.window[0], live.now))
-        live.forget_wishes()
         # Limits and gains may be others at the next wish.
         self._known = None
         self.look()

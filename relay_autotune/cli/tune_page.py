@@ -231,13 +231,13 @@ class _LoopOnPage:
     def _tune(self, wish: PageCommand) -> int:
         """Tune until the result is there."""
         client, live = self._client, self._live
-        live.forget_wishes()
         before = live.told
         try:
             self._take(wish)
         except RelayAutotuneError as error:
             live.rest(str(error), good=False)
             return DONE
+        live.forget_questions()
         self._cycles.clear()
         self._ultimate, self._ends, self._heeded = {}, [], len(self._interrupted)
         live.show("model", None)
@@ -282,7 +282,6 @@ class _LoopOnPage:
         if tune.has_gains:
             self._loop.after_tune()
         self._gains.look_after_tune(tune)
-        live.forget_wishes()
         if tune.left:
             # What the plant does now matters more than the tune.
             live.tell(window=())

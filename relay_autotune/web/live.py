@@ -156,6 +156,7 @@ class Live:
         self._signals = {"measurement": _Signal(), "command": _Signal()}
         self._begun = time.monotonic()
         self._wishes: deque[PageCommand] = deque()
+        self._taken: PageCommand | None = None
         self._shown: dict[str, Any] = {}
         self._shown_anew: set[str] = set()
         self.abort = threading.Event()
@@ -184,6 +185,7 @@ class Live:
         :param good: whether it went well.
         :param changed: other fields of `Told`.
         """
+        self._taken = None
         self.tell(phase="idle", status=status, tone="good" if good else "bad", **changed)
 
     def show(self, name: str, document: Any) -> None:
@@ -214,33 +216,36 @@ class Live:
             self._signals[signal].kept.append(at)
             self._signals[signal].new.append(at)
 
-    def wish(self, wish: PageCommand) -> None:
-        """Take a wish of a page.
+    def wish(self, wish: PageCommand) -> str:
+        """Take a wish of a page, and return why it is refused; empty: it is not.
 
-        :param wish: during a tune or a verification only its end can be wished; while the plan of
-            another page is looked at, what was agreed to waits for its turn.
+        :param wish: during a tune or a verification only its end can be wished; else it waits for
+            its turn. Of what is agreed to one thing is taken, so that none can be forgotten.
         """
-        phase = self.told.phase
         if wish.what == ABORT:
             self.abort.set()
-        elif phase == "idle" or (phase == "checking" and not wish.dry):
-            self._wishes.append(wish)
+            return ""
+        with self._lock:
+            agreed = any(each and not each.dry for each in (self._taken, *self._wishes))
+            waits = self._told.phase in ("idle", "checking", "applying")
+            if waits and (wish.dry or not agreed):
+                self._wishes.append(wish)
+            elif not wish.dry:
+                return "not done: another wish came first; see what it does, then ask again"
+        return ""
 
     def next_wish(self) -> PageCommand | None:
-        """Return the next wish; None: there is none."""
-        return self._wishes.popleft() if self._wishes else None
-
-    def forget_wishes(self) -> None:
-        """Drop what was wished before a tune began or ended, such as by a second click."""
-        self._wishes.clear()
-        self.abort.clear()
+        """Return the next wish, once the one before is done; None: there is none."""
+        with self._lock:
+            self._taken = self._wishes.popleft() if self._wishes else None
+            # It was meant for what was done before.
+            self.abort.clear()
+            return self._taken
 
     def forget_questions(self) -> None:
-        """Drop what was only asked while a plan was looked at, which its page asks again."""
-        for wish in list(iter(self.next_wish, None)):
-            if not wish.dry:
-                self._wishes.append(wish)
-        self.abort.clear()
+        """Drop what was only asked, and is asked again by its page, or not any more."""
+        with self._lock:
+            self._wishes = deque(wish for wish in self._wishes if not wish.dry)
 
     def everything(self) -> dict[str, Any]:
         """Return what a page shows that has just been opened."""

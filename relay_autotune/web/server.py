@@ -395,7 +395,8 @@ class _Socket(_Guarded, WebSocketHandler):
                 loop = question.get("loop", 0)
                 if not (isinstance(loop, int) and 0 <= loop < len(self.page.lives)):
                     raise TuningError("there is no such loop")
-                self.page.lives[loop].wish(self._wish(question))
+                if refused := self.page.lives[loop].wish(self._wish(question)):
+                    self.tell(wire.to_text({"loop": loop, "refused": refused}))
                 return
             count = question["n"]
             number, asked = self.page.question(question["of"], question["asked"])

@@ -103,13 +103,39 @@ def test_only_what_is_possible_can_be_wished():
     live.wish(PageCommand("start"))
     assert live.next_wish() == PageCommand("start")
     live.tell(phase="tuning")
-    live.wish(PageCommand("apply"))
-    assert live.next_wish() is None
+    assert live.wish(PageCommand("apply")).startswith("not done: another wish came first")
     assert not live.abort.is_set()
-    live.wish(PageCommand("abort"))
+    assert live.wish(PageCommand("abort")) == ""
     assert live.abort.is_set()
-    live.forget_wishes()
+    live.rest("cancelled", good=False)
+    # as soon as it is told that it is over
+    assert live.wish(PageCommand("apply")) == ""
+    assert live.next_wish() == PageCommand("apply")
     assert not live.abort.is_set()
+
+
+def test_of_what_is_agreed_to_at_the_same_time_one_is_done_and_the_other_page_hears_why_not():
+    """It was dropped without a word, by what the first one began or ended with."""
+    live = Live("/relay_node")
+
+    async def both(socket):
+        await heard(socket, lambda m: "subjects" in m)
+        for what in ("start", "apply"):
+            await socket.write_message(json.dumps({"do": what}))
+        return await heard(socket, lambda m: "refused" in m)
+
+    with served([], live=live) as url:
+        # the first waits for its turn, or was taken and has told nothing yet
+        told = talk(url, both)
+        assert told == {"loop": 0, "refused": live.wish(PageCommand("revert"))}
+        assert live.next_wish() == PageCommand("start")
+        assert live.wish(PageCommand("revert")) == told["refused"]
+    # a question takes nobody's turn, and is answered after what is done
+    assert live.wish(PageCommand("apply", dry=3)) == ""
+    live.rest("refused", good=False)
+    assert live.next_wish() == PageCommand("apply", dry=3)
+    assert live.wish(PageCommand("revert")) == ""
+    assert live.next_wish() == PageCommand("revert")
 
 
 def test_the_model_of_a_running_tune_lies_on_the_data_with_its_intervals():
@@ -358,6 +384,19 @@ def test_on_a_phone_a_wish_shows_what_comes_of_it_and_a_model_stands_once(tmp_pa
         wish = tab.until(live.next_wish, "the wish")
         assert (wish.dry, wish.step) == (0, 2.0)
         assert tab.eval("scrollY") == 0
+        # of two pages that agree at the same time the later one is told, until it asks again
+        live.rest("passed", good=True)
+        tab.wait("!document.querySelector('#start').disabled")
+        tab.click("#start")
+        asked = tab.until(live.next_wish, "the wish")
+        live.tell(plan=PagePlan(asked.dry))
+        tab.wait("!document.querySelector('#plan-yes').disabled")
+        assert live.wish(wish) == ""
+        tab.click("#plan-yes")
+        tab.wait("document.querySelector('#gone').checkVisibility()")
+        assert tab.text("#gone").startswith("not done: another wish came first")
+        tab.click("#start")
+        tab.wait("document.querySelector('#gone').hidden")
         # the figure of a proof does not stand beside the gains of the next tune
         live.tell(phase="tuning", proof=())
         tab.wait("document.querySelector('#proof').hidden")

@@ -367,9 +367,16 @@ function showLoop() {
 const plan = new Plan();
 let live = null; // made when the server has a loop to watch
 
+// What stands in the bar until something else is done; empty: nothing.
+function warn(text) {
+  $("gone").hidden = !text;
+  $("gone").textContent = text;
+}
+
 function take(message) {
+  if (message.refused) { warn(message.refused); return; }
   if (message.live || message.samples || message.shown) {
-    live ??= new Live((what, more) => socket.send(JSON.stringify({ do: what, ...more })), plan, offered, showLoop);
+    live ??= new Live((what, more) => { warn(""); socket.send(JSON.stringify({ do: what, ...more })); }, plan, offered, showLoop);
     live.take(message);
     if (chosen >= 0) showOf();
     return;
@@ -432,11 +439,10 @@ function take(message) {
 
 function connect() {
   socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket`);
-  socket.addEventListener("open", () => { $("gone").hidden = true; waiting = 0; });
+  socket.addEventListener("open", () => { warn(""); waiting = 0; });
   socket.addEventListener("message", (event) => take(JSON.parse(event.data)));
   socket.addEventListener("close", () => {
-    $("gone").hidden = false;
-    $("gone").textContent = "The command that serves this page has ended, or cannot be reached; the page shows what it knew last.";
+    warn("The command that serves this page has ended, or cannot be reached; the page shows what it knew last.");
     setTimeout(connect, 1000);
   });
 }
