@@ -18,10 +18,12 @@ import signal
 import threading
 import uuid
 from asyncio import CancelledError as TaskCancelledError
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import CancelledError
+from contextlib import suppress
 from multiprocessing import forkserver, resource_tracker
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, Self
 
@@ -226,45 +228,55 @@ _PRELOADED = [
 ]
 
 Work = Callable[[Job], Done]
+# Connection, whose type differs between systems.
+_Pipe = Any
 
 
 def in_processes(jobs: Sequence[Job], count: int, do: Work = work) -> Iterator[tuple[int, Done]]:
     """Do jobs in processes of this machine; yield the number of each and its result.
 
-    A job that crashes its process is tried once more in a separate process, and then reported.
+    A job that crashes its process is tried once more, alone after all others, and then reported.
 
     :param jobs: what to do.
     :param count: number of processes.
     :param do: does one job.
     """
-    waiting = dict(enumerate(jobs))
-    while waiting:
-        alone: list[int] = []
-        with _pool(min(count, len(waiting))) as pool:
-            futures = {pool.submit(do, job): number for number, job in waiting.items()}
-            for future in as_completed(futures):
+    waiting = deque(range(len(jobs)))
+    again: set[int] = set()
+    # Each process has a pipe of its own: it can be ended anywhere without a lock that stays closed
+    # for the others, as in a pool.
+    idle: list[_Pipe] = []
+    busy: dict[_Pipe, int] = {}
+    try:
+        while waiting or busy:
+            while waiting and len(busy) < (1 if waiting[0] in again else count):
+                pipe = idle.pop() if idle else _worker(do)
+                busy[pipe] = number = waiting.popleft()
+                # If its process has just been ended, this is found below.
+                with suppress(OSError):
+                    pipe.send(jobs[number])
+            over: list[_Pipe] = wait(list(busy))
+            for pipe in over:
+                number = busy.pop(pipe)
                 try:
-                    done = future.result()
-                except BrokenProcessPool:
-                    # One of the started jobs is the cause; jobs start in the order of numbers.
-                    alone = sorted(waiting)[: 2 * count]
-                    break
-                number = futures[future]
-                del waiting[number]
+                    done = pipe.recv()
+                    idle.append(pipe)
+                except (EOFError, OSError):
+                    pipe.close()
+                    if number not in again:
+                        again.add(number)
+                        waiting.append(number)
+                        continue
+                    reason = "its process was ended from outside, perhaps for want of memory"
+                    done = died(jobs[number], reason)
                 yield number, done
-        for number in alone:
-            yield number, _alone(waiting.pop(number), do)
+    finally:
+        for pipe in (*idle, *busy):
+            pipe.close()
 
 
-def _alone(job: Job, do: Work) -> Done:
-    with _pool(1) as pool:
-        try:
-            return pool.submit(do, job).result()
-        except BrokenProcessPool:
-            return died(job, "its process was ended from outside, perhaps for want of memory")
-
-
-def _pool(count: int) -> ProcessPoolExecutor:
+def _worker(do: Work) -> _Pipe:
+    """Start a process that does jobs until its pipe is closed, and return this end of the pipe."""
     # A fork of a process with threads, which numpy may start, can hang.
     context = multiprocessing.get_context("forkserver")
     # The modules that every job needs are loaded once, in the process that is forked.
@@ -277,7 +289,17 @@ def _pool(count: int) -> ProcessPoolExecutor:
         forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    return ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_the_command)
+    ours, theirs = context.Pipe()
+    with theirs:
+        context.Process(target=_do_jobs, args=(theirs, do), daemon=True).start()
+    return ours
+
+
+def _do_jobs(pipe: _Pipe, do: Work) -> None:
+    _end_with_the_command()
+    with suppress(EOFError, OSError):
+        while True:
+            pipe.send(do(pipe.recv()))
 
 
 def _end_with_the_command() -> None:

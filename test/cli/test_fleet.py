@@ -9,6 +9,7 @@ import csv
 import functools
 import importlib.util
 import json
+import multiprocessing.forkserver
 import os
 import signal
 import subprocess
@@ -18,7 +19,7 @@ import time
 from pathlib import Path
 
 import pytest
-from fleet_work import die_of_bag_3, die_once, mark, wait_for_ever
+from fleet_work import die, die_of_bag_3, die_once, mark, wait_for_ever
 from made_bags import REPOSITORY
 
 from relay_autotune.analysis import Task
@@ -32,6 +33,21 @@ from relay_autotune.errors import BagError
 STEP = REPOSITORY / "bags" / "step_test"
 # A method that finds nothing in a step test leaves the time to what is tested here.
 QUICK = ("--method", "thyagarajan")
+
+
+@pytest.fixture(autouse=True)
+def deadline():
+    """Fail where a process that is missed would be waited for forever."""
+
+    def end(*_):
+        pytest.fail("still waiting after 240 s")
+
+    before = signal.signal(signal.SIGALRM, end)
+    # again, if what is left waits, too
+    signal.setitimer(signal.ITIMER_REAL, 240.0, 20.0)
+    yield
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    signal.signal(signal.SIGALRM, before)
 
 
 def run(capsys, *arguments):
@@ -138,6 +154,31 @@ def test_a_bag_that_takes_its_process_down_is_reported_and_the_others_are_done(t
     for number, done in found:
         assert done.status == (1 if number == 3 else 0)
     assert "ended from outside" in dict(found)[3].said[0]
+
+
+def test_processes_that_die_while_bags_are_still_handed_out_do_not_end_the_command(tmp_path):
+    """A pool of the standard library refused the next bag then, or waited for it forever."""
+    found = dict(in_processes(jobs(20, tmp_path), 6, die))
+    assert sorted(found) == list(range(20))
+    assert all("ended from outside" in done.said[0] for done in found.values())
+
+
+def test_a_bag_whose_process_died_for_another_reason_is_done_in_the_end(tmp_path):
+    do = functools.partial(die_once, number=2)
+    found = list(in_processes(jobs(6, tmp_path), 2, do))
+    assert (tmp_path / "died").exists()
+    assert sorted(number for number, _ in found) == list(range(6))
+    assert found[-1][0] == 2 and all(done.status == 0 for _, done in found)
+
+
+def test_a_process_that_forks_others_is_started_again_when_it_is_killed(tmp_path):
+    found = in_processes(jobs(3, tmp_path), 1, mark)
+    assert next(found)[1].status == 0
+    number = multiprocessing.forkserver._forkserver._forkserver_pid
+    os.kill(number, signal.SIGKILL)
+    os.waitid(os.P_PID, number, os.WEXITED | os.WNOWAIT)
+    assert len(list(found)) == 2
+    assert len(list(in_processes(jobs(3, tmp_path), 2, mark))) == 3
 
 
 def test_a_cluster_of_which_a_worker_is_killed_loses_nothing_and_does_nothing_twice(

@@ -20,10 +20,13 @@ def mark(job: Job) -> Done:
     return Done(job.name, 0, (), "{}")
 
 
-def die_of_bag_3(job: Job) -> Done:
-    if job.name == "bag3":
-        os.kill(os.getpid(), signal.SIGKILL)
+def die(job: Job) -> Done:
+    os.kill(os.getpid(), signal.SIGKILL)
     return mark(job)
+
+
+def die_of_bag_3(job: Job) -> Done:
+    return die(job) if job.name == "bag3" else mark(job)
 
 
 def die_once(job: Job, number: int) -> Done:
