@@ -25,7 +25,7 @@ from relay_autotune.cli.terminal import UNITS, WIDEST, Working
 from relay_autotune.cli.tune_view import Paint, result_lines
 from relay_autotune.control.controller import Control
 from relay_autotune.control.step_choice import StepChoice, StepRange
-from relay_autotune.control.verification import SETTLES, noise_of
+from relay_autotune.control.verification import RUNAWAY, SETTLES, noise_of
 from relay_autotune.errors import TuningError
 from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
 from relay_autotune.loop.gains import Controller, Gains
@@ -196,7 +196,12 @@ class Proof:
             f"{options.command} is expected {self._choice.expected(step)}, never beyond "
             f"{commands.low:g} to {commands.high:g} u."
         )
-        return ("moves", moves), ("expected", expected)
+        fails = (
+            f"If it fails, or {options.measurement} leaves {self._within.low:g} to "
+            f"{self._within.high:g} y or moves {RUNAWAY:g} times as far as predicted, it ends "
+            f"there: {options.command} goes to {rest.baseline:.6g} u."
+        )
+        return ("moves", moves), ("expected", expected), ("if it fails", fails)
 
     @contextmanager
     def _started(self, doubtful: bool) -> Iterator[GainsClient]:
@@ -258,7 +263,9 @@ class Proof:
             controller.find(START_WITHIN, leave)
             with controller.offered(self._message) as gains:
                 found = controller.prove(step, 0.0, patience, tell, leave, gains)
-                controller.let_settle(self._choice.settles, tell, "the loop goes back", leave)
+                if found.passed:
+                    # Without gains it would hold its command, wherever that is.
+                    controller.let_settle(self._choice.settles, tell, "the loop goes back", leave)
             show(controller.steps_of(found))
         return found
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +21,7 @@ from relay_autotune.cli.apply_gains import found_entries, verdict_entries
 from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import labelled
+from relay_autotune.cli.tuned import Proof
 from relay_autotune.control.controller import Control, Step
 from relay_autotune.control.step_choice import StepChoice, StepRange
 from relay_autotune.control.verification import plan
@@ -36,8 +38,9 @@ from relay_autotune.text import duration
 from relay_autotune.tuning import design
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.web.live import PROVE, VERIFY, Live, PageCommand
-from relay_autotune_msgs.action import Verify
+from relay_autotune_msgs.action import Tune, Verify
 from relay_autotune_msgs.msg import PidGains, Verification
+from relay_autotune_msgs.msg import TransferFunction as TransferFunctionMessage
 
 MODEL = TransferFunction.fopdt(1.65, 1.0, 0.5)
 GAINS = design(DesignTask(model=MODEL, options=DesignOptions()), "imc")
@@ -213,6 +216,41 @@ def test_without_a_record_of_a_tune_the_node_alone_refuses_a_step() -> None:
     assert "expected" not in plan and "come back" in plan["if it fails"]
     with pytest.raises(TuningError, match="expected other than 0"):
         unknown.plan(0.0)
+
+
+def test_a_proof_says_what_happens_if_it_fails_and_then_holds_no_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """After a step that ran away the command stood where it was, for the time of a settling."""
+    record = Record(
+        time=0.1 * np.arange(401.0), measurement=np.full(401, 40.0), command=np.full(401, 2.0),
+        settings=RelaySettings(40.0, 2.0, 1.0), noise_std=0.0, cycle_start=(0, 200, 400),
+    )  # fmt: skip
+    result = Tune.Result(gains=MESSAGE)
+    result.transfer_function = TransferFunctionMessage(
+        structure="general", numerator=[1.65], denominator=[1.0, 1.0], dead_time=0.5
+    )
+    options = SimpleNamespace(
+        within=(30.0, 50.0), command_within=(0.0, 5.0), step=0.5, measurement="/level",
+        command="/valve",
+    )  # fmt: skip
+    loop = SimpleNamespace(options=options)
+    tune: Any = SimpleNamespace(result=result, record=record, options=options, loop=loop)
+    proof = Proof(tune)
+    assert dict(proof.plan(proof.step))["if it fails"] == (
+        "If it fails, or /level leaves 30 to 50 y or moves 3 times as far as predicted, it ends "
+        "there: /valve goes to 2 u."
+    )
+    did: list[str] = []
+    for passed in (False, True):
+        node = SimpleNamespace(
+            find=lambda *_: None, offered=nullcontext, steps_of=lambda _: [],
+            prove=lambda *_, passed=passed: did.append("proof") or Verify.Result(passed=passed),
+            let_settle=lambda *_: did.append("settles"),
+        )  # fmt: skip
+        monkeypatch.setattr(proof, "_started", lambda _, node=node: nullcontext(node))
+        proof.made(proof.step, False, lambda _: None, lambda: False)
+    assert did == ["proof", "proof", "settles"]
 
 
 def test_a_plan_counts_the_time_in_which_the_loop_settles_with_new_gains() -> None:
