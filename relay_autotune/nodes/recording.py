@@ -283,7 +283,8 @@ class Recordings:
         :param experiment_id: its id, which names the folder.
         :param directory: where the folder is made.
         """
-        folder = Path(directory).expanduser() / experiment_id
+        # Whoever is told of it may be in another folder.
+        folder = Path(directory).expanduser().absolute() / experiment_id
         self._kept = {name: each for name, each in self._kept.items() if not each.is_closed}
         self._kept[experiment_id] = recording = Recording(self._node, self._ends(), folder)
         return recording

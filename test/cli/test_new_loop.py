@@ -983,6 +983,11 @@ def test_somebody_without_a_controller_is_told_how_to_start_one(
     assert topics["ros__parameters"] == {n: given[n] for n in topics["ros__parameters"]}
     words = with_gains_file(["--gains", short[-1], "--ros-args", "-p", "kc:=1.0"])
     assert words[:3] == ["--ros-args", "-p", "kc:=1.0"]
+    # It is typed in any folder, and goes with its recording.
+    file = Path(short[-1])
+    assert file.is_absolute()
+    moved = file.parent.rename(f"{file.parent}_moved") / file.name
+    assert with_gains_file(["--gains", str(moved)])[3:] == words[6:]
     assert words[3:] == [
         *("--ros-args", "--params-file", short[-1], "-r", "measurement:=/tank/level"),
         *("-r", "controller_command:=/tank/valve"),

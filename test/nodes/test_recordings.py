@@ -95,6 +95,17 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
     assert "[WARN]" in told and "lacking is closed without" in told
 
 
+def test_its_path_can_be_typed_in_another_folder(
+    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    topics = ("measurement", "command")
+    ends = {name: node.create_publisher(Float64, name, 10) for name in topics}
+    recordings = Recordings(node, lambda: ends)
+    assert recordings.begin("one", "records").path == tmp_path / "records" / "one"
+    recordings.close_all("", 10.0)
+
+
 def test_it_waits_as_long_as_the_identifier_gets_on(
     node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
