@@ -148,16 +148,17 @@ class Ready:
         """A sentence on the commands of the tune."""
         parameters, baseline = self.parameters, self.baseline
         levels = Levels(parameters, baseline)
-        plan = f"relay between {levels.low:g} and {levels.high:g} about the baseline {baseline:g}"
+        between = f"{levels.low:g} and {levels.high:g} u"
+        plan = f"relay between {between} about the baseline {baseline:g}"
         if parameters.finds_amplitude:
             plan += (
                 f" at first; these grow until the oscillation is clear of the noise, up to "
-                f"{parameters.command_min:g} and {parameters.command_max:g}"
+                f"{parameters.command_min:g} and {parameters.command_max:g} u"
             )
         elif self.from_small:
             small = Levels(parameters, baseline, from_small=True)
             plan += (
-                f"; for the first cycle between {small.low:g} and {small.high:g}: the swing has "
+                f"; for the first cycle between {small.low:g} and {small.high:g} u: the swing has "
                 f"to grow with the levels if the actuator goes as far; that takes about "
                 f"{SMALL_CYCLES} oscillations"
             )

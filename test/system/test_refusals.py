@@ -194,9 +194,9 @@ def test_a_dry_run_says_what_would_be_done_and_moves_nothing(idle: Rig) -> None:
 
         answer = idle.until(accepted, "a dry run")
         assert (
-            "relay between -0.7 and 1.3 about the baseline 0; for the first cycle between -0.175 "
-            "and 0.325: the swing has to grow with the levels if the actuator goes as far; that "
-            "takes about 2 oscillations;"
+            "relay between -0.7 and 1.3 u about the baseline 0; for the first cycle between "
+            "-0.175 and 0.325 u: the swing has to grow with the levels if the actuator goes as "
+            "far; that takes about 2 oscillations;"
         ) in answer.reason
         assert "about 7 oscillations of the loop" in answer.reason
         assert answer.experiment_id == ""

@@ -77,7 +77,7 @@ def test_a_tune_is_shown_and_its_result_printed(rig: Rig) -> None:
     ready(rig)
     status, output, said = run(rig, "--namespace", "tank", "--dry-run", "--amplitude", "0.25")
     assert status == 0
-    assert output.startswith("ok    levels        relay between 0.825 and 1.325")
+    assert output.startswith("ok    levels        relay between 0.825 and 1.325 u")
     assert output.endswith("tune_loop --namespace tank --amplitude 0.25\n")
     said = "tune_loop: no relay_node"  # on a busy machine it is not found so soon
     while error(said).startswith("tune_loop: no relay_node"):
