@@ -147,7 +147,7 @@ class GainsPage:
             if message.verdict != PidGains.VERDICT_TRUSTED:
                 yield "note", "doubtful", message.verdict_reason
         if wish.what == REVERT:
-            yield "", "new gains", f"those before{after}"
+            yield "", "new gains", f"those before: {self._found().ask('before')}{after}"
         elif wish.what == APPLY:
             yield "", "step", "none: they are not verified"
 

@@ -196,6 +196,7 @@ class ControllerNode(ServedNode):
         waiting = ReentrantCallbackGroup()
         serve(self, Trigger, "~/apply", lambda _: self._apply(), callback_group=waiting)
         serve(self, Trigger, "~/discard", self._discard)
+        serve(self, Trigger, "~/before", lambda _: self._keeper.before())
         serve(self, Trigger, "~/revert", lambda _: self._keeper.revert(), callback_group=waiting)
         serve(self, SetBool, "~/automatic", self._switch)
         ask_before_changes(self, self._require_settable)

@@ -143,7 +143,7 @@ class GainsClient(LoopClient):
         return gains_at(self, *self._there())
 
     def ask(self, service: str, done: Callable[[], str] = lambda: "") -> str:
-        """Call ~/apply, ~/revert or ~/discard, and return its answer.
+        """Call ~/apply, ~/before, ~/revert or ~/discard, and return its answer.
 
         :param service: which of them.
         :param done: returns a sentence where the service need not be asked again; else "".

@@ -36,7 +36,7 @@ from relay_autotune.control.gains_history import (
     Work,
 )
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.nodes.gains_place import Place
+from relay_autotune.nodes.gains_place import Place, controller_text
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.reasons import Code, reason_of
 from relay_autotune.text import visible
@@ -307,6 +307,14 @@ class GainsKeeper:
             now = self._permitted()
             await self._change(now, now.revert())
         return f"{self._place.sentence(self.history.gains)} again"
+
+    def before(self) -> str:
+        """Say which gains :meth:`revert` would bring back.
+
+        :raises RelayAutotuneError: if there are none, or another operation is in progress.
+        """
+        gains = self._permitted().revert().gains
+        return controller_text(None if gains is None else self._place.controller_of(gains))
 
     def edit(self, gains: GainSet | None) -> None:
         """Note gains that are set by hand, before they are in force.

@@ -19,12 +19,14 @@ GOOD, WILD = (0.5, 0.6), (0.9, 0.3)
 
 def test_revert_leads_to_the_last_whole_set_or_is_refused(rig: Rig) -> None:
     loop = HandLoop(rig, kc=0.3, ti=1.0)
-    refused = loop.trigger("revert")
-    assert not refused.success
-    assert "no gains before these" in refused.message
+    for service in ("revert", "before"):
+        refused = loop.trigger(service)
+        assert not refused.success
+        assert "no gains before these" in refused.message
     assert loop.gains_shown() == (0.3, 1.0)
     assert loop.set(kc=0.7).successful
     assert loop.set(ti=3.0).successful
+    assert loop.trigger("before").message == "kc 0.3, ti 1 s, td 0 s"
     assert loop.trigger("revert").success
     assert loop.gains_shown() == (0.3, 1.0)
     loop.apply(*GOOD, "one")

@@ -41,6 +41,7 @@ def test_a_node_that_hangs_keeps_nobody_waiting_and_gets_its_gains_back(rig: Rig
     offer(loop, "one", kc=0.5, ti=0.3)
     assert loop.trigger("apply").success
     assert loop.values() == pytest.approx([0.5, 0.5 / 0.3, 0.0])
+    assert loop.trigger("before").message.startswith(f"kc {BEFORE[0]:g}, ti ")
     assert loop.trigger("revert").success
     assert loop.values() == BEFORE
     offer(loop, "two", kc=0.7, ti=0.3)

@@ -232,7 +232,7 @@ def test_from_the_start_to_verified_gains_by_clicks(rig: Rig, tmp_path: Path) ->
             "|| document.querySelector('#live-status').innerText.includes('was ended')"
         )
         assert f"{rig.values(gains, 'kc')[0]:.4f}" == calm
-        agree("#revert", "those before")
+        agree("#revert", "those before: kc 0.3, ti 0.8 s")
         tab.wait("document.querySelector('#live-status').innerText.includes('again')")
         assert rig.values(gains, "kc", "ti") == [0.3, 0.8]
         # a refusal is told with its reason

@@ -15,7 +15,7 @@ from relay_autotune.cli import gains_page
 from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.tuned import Proof
 from relay_autotune.control.step_choice import StepRange
-from relay_autotune.errors import TuningError
+from relay_autotune.errors import LoopError, TuningError
 from relay_autotune.exchange.messages import gains_from_message
 from relay_autotune.record.record import Outcome
 from relay_autotune.verdict import Judgement
@@ -76,6 +76,22 @@ def test_an_experiment_that_was_aborted_has_no_gains_to_send():
 def test_gains_that_are_not_there_are_not_sent(wish):
     with pytest.raises(TuningError, match="no such gains"):
         sent(subject_of(analysed()), wish)
+
+
+def test_a_plan_to_return_names_the_gains_that_come_back_or_says_that_there_are_none():
+    answers = ["kc 0.3, ti 1 s, td 0 s", LoopError("refuses: there are no gains before these")]
+
+    def ask(service):
+        assert service == "before"
+        if isinstance(answer := answers.pop(0), str):
+            return answer
+        raise answer
+
+    page = GainsPage(SimpleNamespace(proves=False), Live("/tank"), None, 0, lambda: False)
+    page._controller = SimpleNamespace(find=lambda patience: None, ask=ask)
+    plan = page.plan(PageCommand("revert", dry=1))
+    assert plan.lines[-1][2].startswith("those before: kc 0.3, ti 1 s, td 0 s; at once")
+    assert "no gains before these" in page.plan(PageCommand("revert", dry=2)).refusal
 
 
 def test_a_proof_that_is_refused_leaves_the_one_that_has_passed():
