@@ -228,8 +228,6 @@ _PRELOADED = [
 ]
 
 Work = Callable[[Job], Done]
-# Connection, whose type differs between systems.
-_Pipe = Any
 
 
 def in_processes(jobs: Sequence[Job], count: int, do: Work = work) -> Iterator[tuple[int, Done]]:
@@ -245,8 +243,8 @@ def in_processes(jobs: Sequence[Job], count: int, do: Work = work) -> Iterator[t
     again: set[int] = set()
     # Each process has a pipe of its own: it can be ended anywhere without a lock that stays closed
     # for the others, as in a pool.
-    idle: list[_Pipe] = []
-    busy: dict[_Pipe, int] = {}
+    idle: list[Any] = []
+    busy: dict[Any, int] = {}
     try:
         while waiting or busy:
             while waiting and len(busy) < (1 if waiting[0] in again else count):
@@ -255,7 +253,7 @@ def in_processes(jobs: Sequence[Job], count: int, do: Work = work) -> Iterator[t
                 # If its process has just been ended, this is found below.
                 with suppress(OSError):
                     pipe.send(jobs[number])
-            over: list[_Pipe] = wait(list(busy))
+            over: list[Any] = wait(list(busy))
             for pipe in over:
                 number = busy.pop(pipe)
                 try:
@@ -275,7 +273,7 @@ def in_processes(jobs: Sequence[Job], count: int, do: Work = work) -> Iterator[t
             pipe.close()
 
 
-def _worker(do: Work) -> _Pipe:
+def _worker(do: Work) -> Any:
     """Start a process that does jobs until its pipe is closed, and return this end of the pipe."""
     # A fork of a process with threads, which numpy may start, can hang.
     context = multiprocessing.get_context("forkserver")
@@ -295,17 +293,11 @@ def _worker(do: Work) -> _Pipe:
     return ours
 
 
-def _do_jobs(pipe: _Pipe, do: Work) -> None:
-    _end_with_the_command()
-    with suppress(EOFError, OSError):
-        while True:
-            pipe.send(do(pipe.recv()))
+def _do_jobs(pipe: Any, do: Work) -> None:
+    """Do what comes; end at once by Ctrl-C, and when the command ends, whatever ended that.
 
-
-def _end_with_the_command() -> None:
-    """Let this process end at once by Ctrl-C, and when the command ends, whatever ended that.
-
-    Without it a worker would go on, or wait for work forever.
+    :param pipe: to the command.
+    :param do: does one job.
     """
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -318,6 +310,9 @@ def _end_with_the_command() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+    with suppress(EOFError, OSError):
+        while True:
+            pipe.send(do(pipe.recv()))
 
 
 def on_cluster(jobs: Sequence[Job], address: str, do: Work = work) -> Iterator[tuple[int, Done]]:

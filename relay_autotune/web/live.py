@@ -152,7 +152,7 @@ class Live:
     def __init__(self, node: str) -> None:
         self._lock = threading.Lock()
         self._told = Told(node)
-        self._is_new = True
+        self._known: Told | None = None
         self._signals = {"measurement": _Signal(), "command": _Signal()}
         self._begun = time.monotonic()
         self._wishes: deque[PageCommand] = deque()
@@ -165,8 +165,7 @@ class Live:
     @property
     def told(self) -> Told:
         """What is known now."""
-        with self._lock:
-            return self._told
+        return self._told
 
     def tell(self, **changed: Any) -> None:
         """Change what is known.
@@ -174,9 +173,7 @@ class Live:
         :param changed: fields of `Told`.
         """
         with self._lock:
-            told = replace(self._told, **changed)
-            self._is_new |= told != self._told
-            self._told = told
+            self._told = replace(self._told, **changed)
 
     def rest(self, status: str, *, good: bool, **changed: Any) -> None:
         """Tell that nothing is done any more, and how the last thing went.
@@ -267,9 +264,9 @@ class Live:
         """Return what pages have not been told yet; None: nothing."""
         with self._lock:
             news: dict[str, Any] = {}
-            if self._is_new:
+            if self._known != self._told:
                 news["live"] = _document(self._told)
-                self._is_new = False
+                self._known = self._told
             if self._shown_anew:
                 news["shown"] = {name: self._shown[name] for name in self._shown_anew}
                 self._shown_anew.clear()
