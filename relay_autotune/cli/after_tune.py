@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.cli.arguments import as_typed, say
 from relay_autotune.cli.loops import Steps
-from relay_autotune.cli.own_nodes import PROGRAM, ros_arguments
+from relay_autotune.cli.own_nodes import PROGRAM
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import (
     Working,
@@ -54,7 +54,7 @@ from relay_autotune.exchange.messages import (
     transfer_function_from_message,
 )
 from relay_autotune.loop.gains import Gains
-from relay_autotune.nodes.shell import prefix
+from relay_autotune.nodes.shell import prefix, ros_arguments
 from relay_autotune.nodes.tables import parameters_of_law
 from relay_autotune.reasons import Code
 from relay_autotune.text import digits

@@ -18,10 +18,11 @@ from typing import Any
 
 from relay_autotune import threads  # noqa: F401  before numpy: live and replay are bit-equal
 from relay_autotune.analysis import analyse
-from relay_autotune.cli.own_nodes import OwnNodes, free_domain, ros_arguments
+from relay_autotune.cli.own_nodes import OwnNodes, free_domain
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.messages import stamp_nanoseconds
 from relay_autotune.exchange.models import document, model_fields, to_json
+from relay_autotune.nodes.shell import ros_arguments
 from relay_autotune.process.transfer_function import TransferFunction, process_text
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.recordings import read_experiments

@@ -19,12 +19,7 @@ import yaml
 from relay_autotune.cli.apply_gains import apply_at
 from relay_autotune.cli.arguments import say
 from relay_autotune.cli.loops import Loop, Steps, WhyOver
-from relay_autotune.cli.own_nodes import (
-    PROGRAM,
-    START_WITHIN,
-    namespace_of_joint,
-    ros_arguments,
-)
+from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN, namespace_of_joint
 from relay_autotune.cli.settings import SETTING, Setting
 from relay_autotune.cli.terminal import Working, tell
 from relay_autotune.errors import LoopError, SelectionError
@@ -43,6 +38,7 @@ from relay_autotune.nodes.joint_loop import COMMAND_TYPE, STATE_TYPE, joint_loop
 from relay_autotune.nodes.live_types import CommandMessage, message_class
 from relay_autotune.nodes.loop_client import GoneError, LoopClient
 from relay_autotune.nodes.readiness import ChecklistLine, Mark
+from relay_autotune.nodes.shell import ros_arguments
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune_msgs.action import Tune
 

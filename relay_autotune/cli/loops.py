@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.bag.field_path import first_numbers, unit_of_field
-from relay_autotune.cli.own_nodes import OwnNodes, ros_arguments
+from relay_autotune.cli.own_nodes import OwnNodes
 from relay_autotune.cli.settings import FLAGS, SETTING, Answers, as_flags
 from relay_autotune.cli.terminal import UNITS, Working, asked, broken, width
 from relay_autotune.errors import LoopError, ParameterError, RelayAutotuneError, SelectionError
@@ -32,8 +32,8 @@ from relay_autotune.exchange.messages import (
     reason_from_message,
     transfer_function_from_message,
 )
-from relay_autotune.nodes.shell import typed_for_parameter
-from relay_autotune.nodes.tables import FIXED
+from relay_autotune.nodes.shell import ros_arguments, typed_for_parameter
+from relay_autotune.nodes.tables import sensor_parameters
 from relay_autotune.reasons import Code, Reason
 from relay_autotune.text import in_units
 
@@ -488,9 +488,8 @@ class TopicLoop(Loop):
 
         What a tune may see is not what the sensor can tell, so the measurement has no limits.
         """
-        options, default = self.options, {entry.name: entry.default for entry in FIXED}
+        options = self.options
         low, high = options.command_within or (-math.inf, math.inf)
-        sensor = {"measurement_type": self._kind, "measurement_field": options.field}
         setpoint = self.client.result.experiment.settings.setpoint
         topics = {"measurement": options.measurement}
         # controller_node sends Float64 alone; relay_node passes that on as another type.
@@ -503,7 +502,7 @@ class TopicLoop(Loop):
             noise_std=self.client.result.transfer_function.noise_std,
             model=transfer_function_from_message(self.client.result.transfer_function),
             parameters={
-                **{name: value for name, value in sensor.items() if value != default[name]},
+                **sensor_parameters(self._kind, options.field),
                 "safe_command": options.at,
                 "initial_setpoint": float(f"{setpoint:.6g}"),
             },

@@ -16,14 +16,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from relay_autotune.cli.terminal import Working
 from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.exchange.export import number
 
 PROGRAM = "tune_loop"
 # How long nodes may take to start on a busy machine [s]; one that has ended is not waited for.
@@ -53,26 +52,6 @@ def namespace_of_joint(controller: str, joint: str) -> str:
         f"_{joint}",
     )
     return f"{controller}/tune{escaped}"
-
-
-def ros_arguments(
-    namespace: str,
-    topics: Mapping[str, str] | None = None,
-    values: Mapping[str, Any] | None = None,
-) -> list[str]:
-    """Return the arguments for ROS of a node.
-
-    :param namespace: of the node; empty: the root.
-    :param topics: the names of its topics.
-    :param values: of its parameters.
-    """
-    arguments = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace else []
-    for name, topic in (topics or {}).items():
-        arguments += ["-r", f"{name}:={topic}"]
-    for name, value in (values or {}).items():
-        shown = number(value) if isinstance(value, float) else value
-        arguments += ["-p", f"{name}:={shown}"]
-    return arguments
 
 
 class OwnNodes:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from relay_autotune.cli.apply_gains import found_entries
 from relay_autotune.cli.arguments import exit_status
 from relay_autotune.cli.loops import PATIENCE
-from relay_autotune.cli.own_nodes import START_WITHIN, ros_arguments
+from relay_autotune.cli.own_nodes import START_WITHIN
 from relay_autotune.cli.settings import SETTING
 from relay_autotune.cli.terminal import UNITS, WIDEST, Working
 from relay_autotune.cli.tune_view import Paint, result_lines
@@ -31,6 +31,7 @@ from relay_autotune.exchange.messages import gains_from_message, transfer_functi
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes.gains_client import GainsClient
+from relay_autotune.nodes.shell import ros_arguments
 from relay_autotune.nodes.tables import parameters_of_law, rate_of
 from relay_autotune.record.record import Record
 from relay_autotune.text import digits, duration

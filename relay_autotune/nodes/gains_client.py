@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from action_msgs.msg import GoalStatus
-from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
 from relay_autotune.control.controller import Control
@@ -34,8 +33,8 @@ from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.gains_place import gains_at, in_another_node, mapping_of
 from relay_autotune.nodes.loop_client import ANSWER_WITHIN, GoneError, LoopClient
-from relay_autotune.nodes.shell import prefix
-from relay_autotune.nodes.tables import FIXED, GAINS, rate_from, rate_of
+from relay_autotune.nodes.shell import prefix, ros_arguments
+from relay_autotune.nodes.tables import GAINS, rate_from, rate_of, sensor_parameters
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import may_pass
 from relay_autotune.text import TOLD_EVERY, duration, visible
@@ -61,9 +60,7 @@ class GainsClient(LoopClient):
     """
 
     def __init__(self, namespace: str, node: str, beside: LoopClient | None = None) -> None:
-        super().__init__("apply_gains", namespace, node, beside=beside)
-        self._verify = ActionClient(self._node, Verify, f"{node}/verify")
-        self._ends.callback(self._verify.destroy)
+        super().__init__("apply_gains", namespace, node, beside=beside, action=Verify)
         self.left_behind = "; its set-point may still be moved"
         """What follows where the controller_node of another node's gains is lost in a proof."""
 
@@ -74,13 +71,7 @@ class GainsClient(LoopClient):
         :param leave: returns True to stop waiting.
         :raises LoopError: if it is not there.
         """
-        self._answers_within = max(patience, ANSWER_WITHIN)
-        if not self.wait(lambda: leave() or self._verify.server_is_ready(), patience):
-            there = ", ".join(n for n in self.owners("/verify") if n != self.name) or "none"
-            raise LoopError(
-                f"no controller_node {self.name} within {patience:g} s; nodes that verify gains: "
-                f"{there}. Start it{self._start()}, or name another with --namespace and --node"
-            )
+        self._find("controller_node", "verify gains", patience, leave)
         if leave():
             raise LoopError(f"ended while {self.name} was looked for")
 
@@ -95,14 +86,12 @@ class GainsClient(LoopClient):
             kind, field, *numbers = self.values(relay, names).values()
             measurement = self._topic_of(relay, "measurement", kind, published=False)
             given = dict(zip(("initial_command", *LIMITS), numbers, strict=True))
-            values = [f"{n}:={float(v)}" for n, v in given.items() if math.isfinite(v)]
-            others = {"measurement_type": kind, "measurement_field": field}
-            default = {entry.name: entry.default for entry in FIXED}
-            values += [f"{name}:={v}" for name, v in others.items() if v != default[name]]
-            topics = [f"__ns:={space}"] * bool(space) + [f"measurement:={measurement}"]
-            topics += [f"__node:={own}"] * (own != "controller_node")
-            words = [f"-r {name}" for name in topics] + [f"-p {shlex.quote(v)}" for v in values]
-            return f": {prefix()}controller_node --ros-args {' '.join(words)}"
+            values = {n: v for n, v in given.items() if math.isfinite(v)}
+            values |= sensor_parameters(kind, field)
+            topics = {"measurement": measurement}
+            topics |= {"__node": own} if own != "controller_node" else {}
+            words = ros_arguments(space, topics, values)
+            return f": {prefix()}{shlex.join(['controller_node', '--ros-args', *words])}"
         return ""
 
     def waiting(self) -> tuple[Gains, str]:
@@ -361,7 +350,7 @@ class GainsClient(LoopClient):
         begun = time.monotonic()
         goal.apply = new is not None
         while not leave():
-            sent = self._sent(self._verify, goal, lambda found: tell(visible(found.status)))
+            sent = self._sent(goal, lambda found: tell(visible(found.status)))
             answer = self._ended(sent, leave)
             result = made_visible(answer.result)
             if answer.status == GoalStatus.STATUS_SUCCEEDED:
@@ -386,7 +375,7 @@ class GainsClient(LoopClient):
                 if leave() and until == math.inf:
                     goal.cancel_goal_async()
                     until = time.monotonic() + ANSWER_WITHIN
-            if not self._verify.server_is_ready():
+            if not self._action.server_is_ready():
                 raise GoneError(f"{self.name} has gone during the verification")
             if time.monotonic() >= until:
                 raise GoneError(f"{self.name} has not ended the verification")

@@ -79,6 +79,7 @@ class LoopClient:
     :param ros: arguments for ROS.
     :param beside: another client, whose executor this one uses, and without a namespace its own
         node, too; None: it has its own.
+    :param action: type of the action of that node which is asked for; None: none is.
     :raises ParameterError: if the name is not valid.
     """
 
@@ -92,6 +93,7 @@ class LoopClient:
         node: str,
         ros: Sequence[str] = (),
         beside: LoopClient | None = None,
+        action: Any = None,
     ) -> None:
         try:
             validate_namespace(f"/{namespace.strip('/')}")
@@ -127,6 +129,10 @@ class LoopClient:
         self._joined = time.monotonic()
         self.name = self._node.resolve_service_name(node)
         self._services: dict[str, Any] = {}
+        if action is not None:
+            self._ending = f"/{action.__name__.lower()}"
+            self._action = ActionClient(self._node, action, f"{node}{self._ending}")
+            self._ends.callback(self._action.destroy)
 
     def close(self) -> None:
         """Leave the graph."""
@@ -233,15 +239,36 @@ class LoopClient:
         """
         return self._service(kind, service).call_async(request)
 
-    def _sent(self, action: ActionClient, goal: Any, feedback: Callable[[Any], object]) -> Any:
+    def _find(self, what: str, does: str, patience: float, leave: Callable[[], bool]) -> None:
+        """Wait for the node with the action.
+
+        :param what: its executable.
+        :param does: what nodes with this action do.
+        :param patience: longest wait [s].
+        :param leave: returns True to stop waiting; this method then returns.
+        :raises LoopError: if it is missing; the sentence names the nodes that are there.
+        """
+        self._answers_within = max(patience, ANSWER_WITHIN)
+        if not self.wait(lambda: leave() or self._action.server_is_ready(), patience):
+            # This client itself appears in the graph under the name that it looks for.
+            others = ", ".join(n for n in self.owners(self._ending) if n != self.name) or "none"
+            raise LoopError(
+                f"no {what} {self.name} within {patience:g} s; nodes that {does}: {others}. "
+                f"Start it{self._start()}, or name another with --namespace and --node"
+            )
+
+    def _start(self) -> str:
+        """Return what starts the node, after a colon; empty: it is not known."""
+        return ""
+
+    def _sent(self, goal: Any, feedback: Callable[[Any], object]) -> Any:
         """Send a goal, and return its handle.
 
-        :param action: of this client's node.
         :param goal: what is asked for.
         :param feedback: takes each message of the goal's feedback.
         :raises LoopError: if it is not answered, or rejected.
         """
-        sent = action.send_goal_async(goal, feedback_callback=lambda m: feedback(m.feedback))
+        sent = self._action.send_goal_async(goal, feedback_callback=lambda m: feedback(m.feedback))
         if not self.wait(sent.done, self._answers_within):
             raise LoopError(
                 f"{self.name} has not answered the request within {self._answers_within:g} s"

@@ -5,7 +5,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from shutil import which
+from typing import Any
+
+from relay_autotune.exchange.export import number
 
 
 def prefix() -> str:
@@ -23,3 +27,23 @@ def typed_for_parameter(node: str, name: str, value: object) -> str:
     if which("ros2"):
         return f"type: ros2 param set {node} {name} {value}"
     return f"start {node} with -p {name}:={value}"
+
+
+def ros_arguments(
+    namespace: str,
+    topics: Mapping[str, str] | None = None,
+    values: Mapping[str, Any] | None = None,
+) -> list[str]:
+    """Return the arguments for ROS of a node.
+
+    :param namespace: of the node; empty: the root.
+    :param topics: the names of its topics.
+    :param values: of its parameters.
+    """
+    arguments = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace else []
+    for name, topic in (topics or {}).items():
+        arguments += ["-r", f"{name}:={topic}"]
+    for name, value in (values or {}).items():
+        shown = number(value) if isinstance(value, float) else value
+        arguments += ["-p", f"{name}:={shown}"]
+    return arguments

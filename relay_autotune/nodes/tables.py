@@ -303,6 +303,16 @@ def rate_of(law: str, period: float) -> LawRate | None:
     return None if law in OWN_LAWS else LawRate(LAWS[law], period)
 
 
+def sensor_parameters(kind: str, field: str) -> dict[str, Any]:
+    """Return the parameters with which a node hears a measurement; none where they are usual.
+
+    :param kind: its message type.
+    :param field: path of the number in it.
+    """
+    given = zip(MEASUREMENT_PARAMETERS, (kind, field), strict=True)
+    return {each.name: value for each, value in given if value != each.default}
+
+
 def parameters_of_law(law: str, period: float) -> dict[str, Any]:
     """Return the parameters with which the node runs a law; none for its own.
 

@@ -11,7 +11,6 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any
 
 from action_msgs.msg import GoalStatus, GoalStatusArray
-from rclpy.action import ActionClient
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import qos_profile_sensor_data
 
@@ -24,7 +23,7 @@ from relay_autotune.exchange.messages import (
 )
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.live_types import CommandMessage, reader_of
-from relay_autotune.nodes.loop_client import ANSWER_WITHIN, LoopClient, readable
+from relay_autotune.nodes.loop_client import LoopClient, readable
 from relay_autotune.reasons import Code, Reason
 from relay_autotune.record.record import Record
 from relay_autotune_msgs.action import Tune
@@ -53,9 +52,7 @@ class TuneClient(LoopClient):
     def __init__(
         self, namespace: str, node: str, ros: Sequence[str] = (), beside: LoopClient | None = None
     ) -> None:
-        super().__init__("tune_loop", namespace, node, ros, beside)
-        self._client = ActionClient(self._node, Tune, f"{node}/tune")
-        self._ends.callback(self._client.destroy)
+        super().__init__("tune_loop", namespace, node, ros, beside, Tune)
         self._alive = True
         self._node.create_subscription(
             GoalStatusArray,
@@ -93,14 +90,7 @@ class TuneClient(LoopClient):
         from relay_autotune.exchange import models  # noqa: F401
 
         deadline = time.monotonic() + patience
-        self._answers_within = max(patience, ANSWER_WITHIN)
-        if not self.wait(lambda: leave() or self._client.server_is_ready(), patience):
-            # This client itself appears in the graph under the name that it looks for.
-            others = ", ".join(n for n in self.owners("/tune") if n != self.name) or "none"
-            raise LoopError(
-                f"no relay_node {self.name} within {patience:g} s; nodes that offer a tune: "
-                f"{others}. Start it, or name another with --namespace and --node"
-            )
+        self._find("relay_node", "offer a tune", patience, leave)
         gains = self._resolved("pi_gains")
         if needs_identifier and not self.wait(
             lambda: leave() or self._node.count_publishers(gains) > 0, deadline - time.monotonic()
@@ -118,7 +108,7 @@ class TuneClient(LoopClient):
         :raises LoopError: if the node does not answer.
         """
         goal = Tune.Goal(amplitude=amplitude, dry_run=dry_run)
-        self._goal = self._sent(self._client, goal, self._feedback.append)
+        self._goal = self._sent(goal, self._feedback.append)
         self._answer = self._goal.get_result_async()
 
     def check(self, amplitude: float) -> Any:
@@ -159,7 +149,7 @@ class TuneClient(LoopClient):
         if self.why_ended is not None:
             why, limit = self.why_ended(), _LAST_WORDS
         else:
-            is_there = self._alive and self._client.server_is_ready()
+            is_there = self._alive and self._action.server_is_ready()
             why = "" if is_there else f"{self.name} has gone, or cannot be heard any more"
             limit = _GONE
         self._missed = self._missed + looked if why else 0.0

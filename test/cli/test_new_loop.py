@@ -31,7 +31,7 @@ from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.cli import loops, settings, terminal, tune_loop
 from relay_autotune.cli.after_tune import AfterTune
 from relay_autotune.cli.loops import Loop, TopicLoop
-from relay_autotune.cli.own_nodes import OwnNodes, namespace_of_joint, ros_arguments
+from relay_autotune.cli.own_nodes import OwnNodes, namespace_of_joint
 from relay_autotune.cli.settings import Answers, Kind, kind_of
 from relay_autotune.cli.terminal import (
     GoBack,
@@ -51,6 +51,7 @@ from relay_autotune.nodes import loop_client, shell
 from relay_autotune.nodes.controller import with_gains_file
 from relay_autotune.nodes.loop_client import LoopClient
 from relay_autotune.nodes.readiness import Checklist, answer_of
+from relay_autotune.nodes.shell import ros_arguments
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS
 from relay_autotune.nodes.tune_client import TuneClient
 from relay_autotune.process.transfer_function import TransferFunction
