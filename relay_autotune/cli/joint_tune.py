@@ -94,7 +94,9 @@ class JointLoop(Loop):
                 f"{loop.reference_topic}, and wait until the joint rests there"
             )
         super().__init__(client(namespace_of_joint(loop.node, loop.joint), robot), options)
-        self.client.left_behind = self.left_behind
+        # The reference is given back after that, and told then.
+        back = f"{loop.joint} gets back its controllers of before" if options.open else ""
+        self.client.left_behind = back
         self._take_known()
         if not options.web:
             self.answers.ask(*self._questions())
@@ -115,20 +117,17 @@ class JointLoop(Loop):
         if answers["command_within"] is None and all(map(math.isfinite, found)):
             answers.take({"command_within": found}, "its limits")
 
-    def _questions(self) -> list[Setting]:
-        """Return what is asked for where it is not known."""
+    def _questions(self) -> Iterator[Setting]:
+        """Yield what is asked for where it is not known."""
         loop = self._loop
         of = f"{loop.commanded} of {loop.joint}"
-        may = f"lowest and highest {loop.measured} that {loop.joint} may have"
-        wanted = [replace(SETTING["within"], question=may, example="-5 5")]
-        if self.options.open:
-            at = f"present {of}, at which it rests"
-            wanted.append(replace(SETTING["at"], question=at, example="0"))
-            # The amplitude is found by them.
-            if not self.options.amplitude:
-                ends = f"lowest and highest {of}"
-                wanted.append(replace(SETTING["command_within"], question=ends, example="-2 2"))
-        return wanted
+        for name, question, example in (
+            ("within", f"lowest and highest {loop.measured} that {loop.joint} may have", "-5 5"),
+            ("at", f"present {of}, at which it rests", "0"),
+            ("command_within", f"lowest and highest {of}", "-2 2"),
+        ):
+            if name in self.form:
+                yield replace(SETTING[name], question=question, example=example)
 
     @property
     def title(self) -> str:
@@ -425,12 +424,6 @@ class JointLoop(Loop):
         beside = json.loads(values["command_message"])
         message = CommandMessage(values["command_type"], values["command_field"], beside)
         return message.written(self.options.at), topics["command"]
-
-    @property
-    def left_behind(self) -> str:
-        """What follows where relay_node is lost during a tune."""
-        # The reference is given back after that, and told then.
-        return f"{self._loop.joint} gets back its controllers of before" if self._forward else ""
 
     def _put_back(self) -> str:
         """Give the reference back where its controller takes it; return how the joint is left."""

@@ -324,9 +324,7 @@ class TopicLoop(Loop):
             self._require_alone()
         self._give_up = client.claim(self._commands.kind, command)
         if not options.web:
-            # The amplitude is found between the limits of the command.
-            known = options.amplitude and options.command_within is None
-            answers.ask(*(SETTING[name] for name in self.form[: 2 if known else 3]))
+            answers.ask(*(SETTING[name] for name in self.form))
 
     def _reader(self) -> Reader:
         """Return what reads the measurement; ask where the messages do not have that of --field.

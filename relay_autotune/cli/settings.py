@@ -343,7 +343,7 @@ class Answers:
         for each in questions:
             if (given := self[each.name]) is not None:
                 self.take({each.name: given}, self.source(each.name))
-        self._asked = [each for each in questions if self[each.name] is None]
+        self._asked = [each for each in questions if self._lacks(each.name)]
         told = ["u is the command's unit, y the measurement's"] * (len(UNITS) < 2)
         told += [f"{BACK} at a question goes back to the one before"] * (len(self._asked) > 1)
         if sys.stdin.isatty() and self._asked and told:
@@ -414,9 +414,11 @@ class Answers:
 
         :param names: of the settings.
         """
+        return [SETTING[name].question for name in names if self._lacks(name)]
+
+    def _lacks(self, name: str) -> bool:
         # An amplitude that is given is not searched for between the limits of the command.
-        free = ("command_within",) if self["amplitude"] else ()
-        return [SETTING[n].question for n in names if self[n] is None and n not in free]
+        return self[name] is None and not (name == "command_within" and self["amplitude"])
 
     def parameters(self, names: Collection[str] = tuple(SETTING)) -> dict[str, Any]:
         """Return the parameters of relay_node that the known values set."""
