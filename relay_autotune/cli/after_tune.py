@@ -58,7 +58,6 @@ from relay_autotune.nodes.shell import prefix, ros_arguments
 from relay_autotune.nodes.tables import parameters_of_law
 from relay_autotune.reasons import Code
 from relay_autotune.text import digits
-from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
     from relay_autotune.report.case import Case
@@ -123,9 +122,8 @@ class AfterTune(Tuned):
                 print("\nNext:")
             for what, command in steps:
                 print(f"  {what:<26} {command}")
-        complete = self.has_gains or options.record_only
         written = bool(report) or not options.report
-        return self.status(found=complete and written and proven is not False)
+        return self.status(found=written and proven is not False)
 
     def _compare(self) -> None:
         """Show the gains in force beside the new ones, if a controller of the loop has some."""
@@ -312,8 +310,7 @@ class AfterTune(Tuned):
         told = ", ".join(f"{name} {digits(getattr(gains, name))}" for name in ("kc", "ti", "td"))
         told += f", every {period:g} s; {'; '.join(gains.warnings) or 'Ms ' + digits(gains.ms, 3)}"
         tell(f"for {law}", told)
-        doubtful = found.verdict is not Verdict.TRUSTED
-        return _Written(gains, law, against or found.judgement.reason * doubtful)
+        return _Written(gains, law, against or found.judgement.reason)
 
     def _own_controller(self) -> Steps:
         """Return the commands that control the loop with the gains, without other controllers."""
@@ -350,11 +347,8 @@ class AfterTune(Tuned):
         loop = self.loop
         passed, against = None, _UNFINISHED
         try:
-            if loop.proves:
-                passed, against = self._offered()
-            else:
-                passed, failed = loop.apply(self.doubt)
-                against = _FAILED.format(failed) if failed else ""
+            passed, failed = self._offered() if loop.proves else loop.apply(self.doubt)
+            against = _FAILED.format(failed) if failed else self.doubt * (passed is None)
         except RelayAutotuneError as error:
             say(PROGRAM, f"the gains are not proven: {error}")
             passed, against = False, f"not proven: {error}"
@@ -364,11 +358,12 @@ class AfterTune(Tuned):
         return passed, against
 
     def _offered(self) -> tuple[bool | None, str]:
+        """Offer to prove the gains; return what `Loop.apply` returns."""
         options, doubt = self.options, self.doubt
         asks = options.verify is None and not options.yes and sys.stdin.isatty()
         if not (asks or options.verify):
             print()
-            return None, doubt
+            return None, ""
         with Working("choosing the step"):
             proof = Proof(self)
         step = proof.step
@@ -379,20 +374,17 @@ class AfterTune(Tuned):
             step = agreed_step(question, step, proof.allowed)
             if not step:
                 print()
-                return None, doubt
+                return None, ""
         elif doubt:
             raise TuningError(f"doubtful gains are not proven unasked: {doubt}")
         found = self._made(proof, step)
-        if found.passed:
-            return True, ""
-        return False, _FAILED.format(found.reason)
+        return found.passed, "" if found.passed else found.reason
 
     def _made(self, proof: Proof, step: float) -> Any:
         """Make the step, and show what it has found."""
         with noted(lambda text: say(PROGRAM, text)) as (shown, leave):
-            found = proof.made(step, bool(self.doubt), shown, leave)
+            found, self._proof = proof.made(step, bool(self.doubt), shown, leave)
         print()
-        self._proof = proof.entries(found)
         for entry in self._proof[1:]:
             tell(*entry)
         if proof.rate is not None:

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from relay_autotune.nodes.loop_client import LoopClient
 
 PROGRAM = "apply_gains"
+# What a verification has found: names and texts.
+Entries = tuple[tuple[str, str], ...]
 
 # An uncertainty of the overshoot that is worth showing, as a fraction of the step.
 _SEEN = 0.03
@@ -224,8 +226,8 @@ def verified(
     load: float = 0.0,
     patience: float = REST_WITHIN,
     stays: bool = True,
-) -> tuple[Any, list[tuple[str, str]]]:
-    """Verify gains, and return the `Verify.Result` with what it has found: names and texts.
+) -> tuple[Any, Entries]:
+    """Verify gains, and return the `Verify.Result` with what it has found.
 
     :param client: of the controller_node, which was found.
     :param step: of the set-point [y].
@@ -239,13 +241,14 @@ def verified(
     before = client.in_force()
     result = client.prove(step, load, patience, tell, leave, new)
     try:
-        now = client.in_force()
-        unproven = not result.passed and new is not None and client.has(new)
-        entries = verdict_entries(result, now, stays=stays, unproven=unproven)
+        now = _numbers(client.in_force())
+        if result.passed and stays:
+            now += f"; {PROGRAM} --revert takes those before"
+        if not result.passed and new is not None and client.has(new):
+            now += "; these are the new ones, which are not proven: set those before yourself"
     except LoopError as error:
-        told = f"not known: {error}; before the proof: {_numbers(before)}"
-        entries = [*found_entries(result), ("gains in force", told)]
-    return result, entries
+        now = f"not known: {error}; before the proof: {_numbers(before)}"
+    return result, (*found_entries(result), ("gains in force", now))
 
 
 def _question(options: argparse.Namespace, step: float) -> str:
@@ -260,36 +263,14 @@ def _question(options: argparse.Namespace, step: float) -> str:
             f"{joined}?").capitalize()  # fmt: skip
 
 
-def verdict_entries(
-    result: Any,
-    present: Controller | None,
-    *,
-    stays: bool = True,
-    unproven: bool = False,
-) -> list[tuple[str, str]]:
-    """Return what a verification has found, and the gains in force after it: names and texts.
-
-    :param result: the `Verify.Result`.
-    :param present: the gains in force after it.
-    :param stays: True if the controller_node goes on running.
-    :param unproven: True if the gains in force are new ones that have not passed.
-    """
-    now = _numbers(present)
-    if result.passed and stays:
-        now += f"; {PROGRAM} --revert takes those before"
-    if unproven:
-        now += "; these are the new ones, which are not proven: set those before yourself"
-    return [*found_entries(result), ("gains in force", now)]
-
-
 def _numbers(gains: Controller | None) -> str:
     if gains is None:
         return "none, the command is held"
     return ", ".join(f"{n} {digits(getattr(gains, n))}" for n in ("kc", "ti", "td"))
 
 
-def found_entries(result: Any) -> list[tuple[str, str]]:
-    """Return verdict, response to each step and process of a verification: names and texts.
+def found_entries(result: Any) -> Entries:
+    """Return verdict, response to each step and process of a verification.
 
     :param result: the `Verify.Result`.
     """
@@ -328,4 +309,4 @@ def found_entries(result: Any) -> list[tuple[str, str]]:
         predicted = result.steps[0].ms_predicted
         told = f"gain {gain} times the model's, Ms {ms} (predicted {predicted:.2f})"
         found.append(("process", told))
-    return found
+    return tuple(found)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -87,8 +87,7 @@ class GainsPage:
                 self._controller = GainsClient("", found[0], beside=self.loop.client)
         self._looked = time.monotonic()
         if (controller := self._controller) is None:
-            if self.live.told.controller:
-                self.live.tell(controller="", present="")
+            self.live.tell(controller="", present="")
             return
         try:
             present = controller.in_force()
@@ -196,56 +195,58 @@ class GainsPage:
             live.rest(self._found().ask("revert"), good=True, proof=())
             return
         message = self._message(wish)
-        steps = None if wish.what == APPLY else self._steps(message)
-        if isinstance(steps, Proof):
-            self._prove(steps, wish)
+        if wish.what != APPLY:
+            self._try(wish, message)
             return
-        controller = self._found()
-        with controller.accepting_doubtful() if wish.doubtful else nullcontext():
-            if steps is None:
-                live.tell(phase="applying", tone="", status="putting the gains in force")
-                told = controller.put_in_force(message)
-                live.rest(f"{told}; they are not verified", good=True, proof=())
-                return
-            step = wish.step or steps.step
-            steps.allowed.require(step)
-            with controller.offered(message) if message else nullcontext() as gains:
-                self._verify(controller, step, gains)
+        live.tell(phase="applying", tone="", status="putting the gains in force")
+        with self._accepting(wish) as controller:
+            told = controller.put_in_force(message)
+        live.rest(f"{told}; they are not verified", good=True, proof=())
 
-    def _prove(self, proof: Proof, wish: PageCommand) -> None:
-        """Prove gains by a controller_node of the command, which ends after it."""
-        live, step = self.live, wish.step or proof.step
-        proof.allowed.require(step)
-        self._begin_step(f"starting {CONTROLLER}")
-        result = proof.made(
-            step, wish.doubtful, lambda text: live.tell(status=text), self.leave, self._show_steps
-        )
-        left = f"; the command stands at {self.loop.options.at:.6g} u"
-        entries = proof.entries(result)
-        if result.steps:
-            subject = self.page.subjects[wish.of]
-            subject.case = replace(subject.case, proof=entries)
-        self._rest("proof", result, entries, left)
+    def _try(self, wish: PageCommand, message: Any) -> None:
+        """Make a step that proves gains, and tell how it has ended.
 
-    def _verify(self, controller: GainsClient, step: float, new: Controller | None) -> None:
-        live = self.live
-        self._begin_step("")
-        # The page has a button that takes them back.
-        result, entries = verified(
-            controller, step, lambda text: live.tell(status=text), self.leave, new, stays=False
-        )
-        self._show_steps(controller.steps_of(result))
-        self._rest("verification", result, entries)
-
-    def _rest(
-        self, what: str, result: Any, entries: Sequence[tuple[str, str]], left: str = ""
-    ) -> None:
-        """Tell how a step has ended; the proof before stays where it was cut short."""
-        self.live.rest(
+        :param message: the `PidGains`; None: those in force.
+        """
+        live, steps, what, left = self.live, self._steps(message), "verification", ""
+        step = wish.step or steps.step
+        steps.allowed.require(step)
+        if isinstance(steps, Proof):
+            what, left = "proof", f"; the command stands at {self.loop.options.at:.6g} u"
+            self._begin_step(f"starting {CONTROLLER}")
+            result, entries = steps.made(
+                step, wish.doubtful, self._say, self.leave, self._show_steps
+            )
+            if result.steps:
+                subject = self.page.subjects[wish.of]
+                subject.case = replace(subject.case, proof=entries)
+        else:
+            with (
+                self._accepting(wish) as controller,
+                controller.offered(message) if message else nullcontext() as new,
+            ):
+                self._begin_step("")
+                # The page has a button that takes them back.
+                result, entries = verified(
+                    controller, step, self._say, self.leave, new, stays=False
+                )
+                self._show_steps(controller.steps_of(result))
+        live.rest(
             f"{what} {'passed' if result.passed else 'failed'}: {result.reason}{left}",
             good=result.passed,
-            proof=tuple(entries) if result.steps else self.live.told.proof,
+            # The proof before stays where this one was cut short.
+            proof=entries if result.steps else live.told.proof,
         )
+
+    @contextmanager
+    def _accepting(self, wish: PageCommand) -> Iterator[GainsClient]:
+        """Return the client of the controller_node, which takes what the wish accepts."""
+        controller = self._found()
+        with controller.accepting_doubtful() if wish.doubtful else nullcontext():
+            yield controller
+
+    def _say(self, text: str) -> None:
+        self.live.tell(status=text)
 
     def _show_steps(self, steps: Sequence[Any]) -> None:
         """Show a proof in place of the one before; one that was cut short has no steps."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from relay_autotune.cli.apply_gains import found_entries
+from relay_autotune.cli.apply_gains import Entries, found_entries
 from relay_autotune.cli.arguments import exit_status
 from relay_autotune.cli.loops import PATIENCE
 from relay_autotune.cli.own_nodes import START_WITHIN
@@ -98,13 +98,18 @@ class Tuned:
         """
         return result_lines(self.result, self.client.cancelled, paint, columns, self.left)
 
-    def status(self, *, found: bool) -> int:
+    @property
+    def is_complete(self) -> bool:
+        """Whether it has given what was asked for."""
+        return self.client.succeeded and (self.has_gains or self.options.record_only)
+
+    def status(self, *, found: bool = True) -> int:
         """Return the exit status.
 
-        :param found: whether there is what was asked for.
+        :param found: whether there is what was asked for besides.
         """
         doubtful = self.result.verdict == Verdict.DOUBTFUL
-        return exit_status(found=found and self.client.succeeded, doubtful=doubtful)
+        return exit_status(found=found and self.is_complete, doubtful=doubtful)
 
     @cached_property
     def record(self) -> Record:
@@ -153,28 +158,25 @@ class Proof:
     def __init__(self, tune: Tuned, message: Any = None) -> None:
         result, record, options = tune.result, tune.record, tune.options
         self._loop, self._message = tune.loop, message or result.gains
+        self._gains = gains = gains_from_message(self._message)
         assert record.settings is not None, "gains come of a whole experiment"
         self._rest = rest = record.settings
-        self._within = Limits(*options.within)
+        self._within = options.within
         # Without limits the process has seen the levels of the relay.
-        self._commands = Limits(*(options.command_within or (rest.low, rest.high)))
+        self._commands = options.command_within or (rest.low, rest.high)
+        limits = Limits(*self._within), Limits(*self._commands)
         noise_std = noise_of(record.noise_std, result.transfer_function.residual_rms)
         model = transfer_function_from_message(result.transfer_function)
-        gains = gains_from_message(self._message)
         self.rate = rate_of(gains.law, gains.law_period)
-        self._choice = choice = StepChoice(
-            record, model, Control(gains, self.rate), self._within, self._commands, noise_std
-        )
+        control = Control(gains, self.rate)
+        self._choice = choice = StepChoice(record, model, control, *limits, noise_std)
         if not (step := options.step or choice.best):
             raise TuningError("the limits leave no room for a step: widen --within")
         self.step: float = options.step or choice.allowed.nearest(step)
-        choice.allowed.require(self.step)
-        self._takes = choice.lasts + (SETTLES + 1.0) * choice.settles
-
-    @property
-    def allowed(self) -> StepRange:
+        self.allowed: StepRange = choice.allowed
         """The steps that the limits of the tune allow."""
-        return self._choice.allowed
+        self.allowed.require(self.step)
+        self._takes = choice.lasts + (SETTLES + 1.0) * choice.settles
 
     def plan(self, step: float) -> tuple[tuple[str, str], ...]:
         """Return what will move, how far and how long, in sentences with a name for each.
@@ -183,7 +185,8 @@ class Proof:
         :raises TuningError: if it is not allowed.
         """
         self.allowed.require(step)
-        options, commands, rest = self._loop.options, self._commands, self._rest
+        options, rest = self._loop.options, self._rest
+        (low, high), (least, most) = self._within, self._commands
         runs = ""
         if self.rate is not None:
             runs = f", which runs {self.rate.law.name} every {self.rate.period:g} s,"
@@ -195,12 +198,12 @@ class Proof:
         )
         expected = (
             f"{options.command} is expected {self._choice.expected(step)}, never beyond "
-            f"{commands.low:g} to {commands.high:g} u."
+            f"{least:g} to {most:g} u."
         )
         fails = (
-            f"If it fails, or {options.measurement} leaves {self._within.low:g} to "
-            f"{self._within.high:g} y or moves {RUNAWAY:g} times as far as predicted, it ends "
-            f"there: {options.command} goes to {rest.baseline:.6g} u."
+            f"If it fails, or {options.measurement} leaves {low:g} to {high:g} y or moves "
+            f"{RUNAWAY:g} times as far as predicted, it ends there: {options.command} goes to "
+            f"{rest.baseline:.6g} u."
         )
         return ("moves", moves), ("expected", expected), ("if it fails", fails)
 
@@ -210,32 +213,29 @@ class Proof:
 
         :param doubtful: whether the gains are.
         """
-        loop, rest, within, commands = self._loop, self._rest, self._within, self._commands
-        client, options = loop.client, loop.options
-        kind = client.values(client.name, ["measurement_type"])["measurement_type"]
+        loop, rest, gains = self._loop, self._rest, self._gains
         # The journal of proven and failed gains is that of this controller_node alone.
         with (
             tempfile.TemporaryDirectory() as journal,
-            GainsClient("", f"{loop.space}/{CONTROLLER}", beside=client) as found,
+            GainsClient("", f"{loop.space}/{CONTROLLER}", beside=loop.client) as found,
         ):
             values = {
+                **loop.target.parameters,
                 "initial_setpoint": rest.setpoint,
                 "initial_command": rest.baseline,
                 "safe_command": rest.baseline,
-                **SETTING["within"].values((within.low, within.high)),
-                **SETTING["command_within"].values((commands.low, commands.high)),
-                "measurement_type": kind,
-                "measurement_field": options.field,
+                **SETTING["within"].values(self._within),
+                **SETTING["command_within"].values(self._commands),
                 "accept_doubtful": str(doubtful).lower(),
                 "record_directory": journal,
+                **parameters_of_law(gains.law, gains.law_period),
             }
-            if self.rate is not None:
-                values |= parameters_of_law(self.rate.law.name, self.rate.period)
             # identifier_node's own gains, which may come late, are not the ones to be proven.
-            gains = f"{loop.space}/gains_of_{CONTROLLER}"
-            topics = {"measurement": options.measurement, "pi_gains": gains}
-            arguments = ros_arguments(loop.space, topics, values)
-            loop.nodes.start(CONTROLLER, arguments)
+            topics = {
+                "measurement": loop.options.measurement,
+                "pi_gains": f"{loop.space}/gains_of_{CONTROLLER}",
+            }
+            loop.nodes.start(CONTROLLER, ros_arguments(loop.space, topics, values))
             try:
                 yield found
             finally:
@@ -248,16 +248,16 @@ class Proof:
         tell: Callable[[str], None],
         leave: Callable[[], bool],
         show: Callable[[list[Any]], object] = lambda _: None,
-    ) -> Any:
-        """Put the gains in force, make the step, and go back; return the `Verify.Result`.
+    ) -> tuple[Any, Entries]:
+        """Put the gains in force, make the step, and go back.
 
         :param step: of the set-point [y].
         :param doubtful: whether the gains are.
         :param tell: called with what is waited for.
         :param leave: returns True to end the step.
         :param show: called with the samples of the step.
+        :return: the `Verify.Result`, and what it has found, of which gains and when.
         """
-        self.allowed.require(step)
         patience = max(_TIMES_SETTLING * self._choice.settles, _REST_WITHIN)
         with self._started(doubtful) as controller:
             tell(f"starting {CONTROLLER}")
@@ -268,15 +268,8 @@ class Proof:
                     # Without gains it would hold its command, wherever that is.
                     controller.let_settle(self._choice.settles, tell, "the loop goes back", leave)
             show(controller.steps_of(found))
-        return found
-
-    def entries(self, result: Any) -> tuple[tuple[str, str], ...]:
-        """Return what a proof of now has found, and of which gains: names and texts.
-
-        :param result: the `Verify.Result`.
-        """
-        gains = f"{gains_words(gains_from_message(self._message))}, at {time.strftime('%H:%M')}"
-        return ("gains", gains), *found_entries(result)
+        which = f"{gains_words(self._gains)}, at {time.strftime('%H:%M')}"
+        return found, (("gains", which), *found_entries(found))
 
 
 def gains_words(gains: Controller | None) -> str:

@@ -36,7 +36,6 @@ from relay_autotune.report.page import page as report_page
 from relay_autotune.report.page import style_sheet
 from relay_autotune.text import in_units, visible
 from relay_autotune.tuning import RULES
-from relay_autotune.verdict import Verdict
 from relay_autotune.web import wire
 from relay_autotune.web.address import Address
 from relay_autotune.web.live import Live, PageCommand
@@ -335,8 +334,7 @@ class _Export(_Guarded):
             )
             if name not in exports_of(shaped.gains.law):
                 raise HTTPError(HTTPStatus.NOT_FOUND)
-            judgement = shaped.judgement
-            doubt = judgement.reason if judgement.verdict is Verdict.DOUBTFUL else ""
+            doubt = shaped.judgement.reason
             if doubt and self.get_query_argument("accept_doubtful", "") != "yes":
                 raise TuningError("these gains are doubtful, and were not accepted")
             text = exported(shaped.gains, name, subject.target, doubt=doubt)

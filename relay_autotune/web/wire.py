@@ -35,7 +35,6 @@ from relay_autotune.report.style import in_steps, thinned
 from relay_autotune.result import Shaping
 from relay_autotune.text import digits, percent, visible
 from relay_autotune.tuning.task import DesignOptions
-from relay_autotune.verdict import Verdict
 from relay_autotune.web.shape import CALM, FAST, STEP, DesignRequest, DesignResult, PageModel
 
 # Samples at which the model of a running tune is computed.
@@ -181,9 +180,7 @@ def of_shaped(subject: PageModel, shaped: DesignResult) -> dict[str, Any]:
         "reason": visible(gains.reason),
         "verdict": _verdict(case),
         "checks": _checks(case),
-        "doubtful": visible(shaped.judgement.reason)
-        if shaped.judgement.verdict is Verdict.DOUBTFUL
-        else "",
+        "doubtful": visible(shaped.judgement.reason),
         "warnings": notes,
         "remarks": [visible(text) for text in remarks_of(case)],
         "isa": [[n, digits(v), unit, meaning] for n, v, unit, meaning in isa],

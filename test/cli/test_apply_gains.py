@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from relay_autotune.cli import apply_gains
-from relay_autotune.cli.apply_gains import found_entries, verdict_entries
+from relay_autotune.cli.apply_gains import Entries, found_entries, verified
 from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import labelled
@@ -48,7 +48,13 @@ MESSAGE = PidGains()
 fill_gains(MESSAGE, GAINS, experiment_id="x")
 
 
-def laid_out(entries: list[tuple[str, str]], columns: int) -> list[str]:
+def verdict_entries(result: Any, present: Controller | None) -> Entries:
+    """Return what is told of a verification, after which gains are in force."""
+    client: Any = SimpleNamespace(in_force=lambda: present, prove=lambda *words: result)
+    return verified(client, 0.5, print, lambda: False, None)[1]
+
+
+def laid_out(entries: Entries, columns: int) -> list[str]:
     """Return the lines that a terminal of some columns shows."""
     return [line for entry in entries for line in labelled(*entry, columns)]
 

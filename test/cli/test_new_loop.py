@@ -43,6 +43,7 @@ from relay_autotune.cli.terminal import (
     pair_of,
 )
 from relay_autotune.cli.tune_page import _LoopOnPage
+from relay_autotune.cli.tuned import Tuned
 from relay_autotune.control.step_choice import StepRange
 from relay_autotune.errors import LoopError, NotReadyError, ParameterError, SelectionError
 from relay_autotune.exchange.export import EXPORTS, Target, exported
@@ -857,7 +858,11 @@ def shown(
         given.command_within = command_within
         given.export, given.accept_doubtful = export, accept_doubtful
         result.bag = tempfile.mkdtemp(dir=tmp_path) if bag is None else bag
-        monkeypatch.setattr(AfterTune, "_offered", lambda _: (passed, against))
+        # Gains that were not tried may be doubtful.
+        doubt = against * (passed is None)
+        result.verdict = Tune.Result.VERDICT_DOUBTFUL if doubt else Tune.Result.VERDICT_TRUSTED
+        result.verdict_reason = doubt
+        monkeypatch.setattr(AfterTune, "_offered", lambda _: (passed, against[len(doubt) :]))
         loop = topic_loop(client, given)
         loop._command_kind = command_type
         loop.nodes = nodes
@@ -888,7 +893,7 @@ def test_a_file_that_needs_limits_is_written_from_the_recording(
 def test_gains_that_failed_are_not_recommended_and_their_file_says_so(
     shown: Callable[..., str], tmp_path: Path
 ) -> None:
-    failed = shown(False, "the step that was to prove them failed: it runs away", "failed.yaml")
+    failed = shown(False, "it runs away", "failed.yaml")
     assert "the command stands at 35 u" in failed and "start your own" not in failed
     assert f"controller_node: {tmp_path / 'failed.yaml'}" in failed
     assert failed.endswith("NEXT")
@@ -942,7 +947,8 @@ def test_a_program_that_is_named_gets_gains_of_its_own_and_a_start_without_a_bum
     (period,) = re.findall(r"Designed for iec_61131_3_pid every ([\d.]+) s", text)
     assert f"--law iec_61131_3_pid --sample-period {period} --verify" in told
     other = shown(False, "it runs away", "px4_rate", "0.1", "px4.txt")
-    assert "# DOUBTFUL: it runs away" in (tmp_path / "px4.txt").read_text()
+    told = "# DOUBTFUL: the step that was to prove them failed: it runs away"
+    assert told in (tmp_path / "px4.txt").read_text()
     assert other.endswith("NEXT")
 
 
@@ -1159,6 +1165,14 @@ def test_a_joint_whose_model_was_cancelled_is_said_to_have_its_reference(
     assert AfterTune(loop, tune_loop._parser()).conclude() == 1
     told = capsys.readouterr().out
     assert "the reference of left is that of before; no gains" in " ".join(told.split())
+
+
+@pytest.mark.parametrize(("words", "status"), [((), 1), (("--record-only",), 0)])
+def test_a_recording_alone_is_complete_without_gains(words: tuple[str, ...], status: int) -> None:
+    found = Tune.Result(outcome=Tune.Result.COMPLETED)
+    client: Any = SimpleNamespace(result=found, succeeded=True)
+    tune = Tuned(Loop(client, tune_loop._parser().parse_args(words)))
+    assert (tune.is_complete, tune.status()) == (status == 0, status)
 
 
 @pytest.mark.parametrize(

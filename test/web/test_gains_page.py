@@ -12,6 +12,7 @@ from analysed import analysed_once
 from served import analysed, subject_of
 
 from relay_autotune.cli import gains_page
+from relay_autotune.cli.apply_gains import found_entries
 from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.tuned import Proof
 from relay_autotune.control.step_choice import StepRange
@@ -129,7 +130,6 @@ def test_a_proof_is_in_the_report_of_its_gains_and_is_computed_once(monkeypatch)
         allowed = StepRange(-1.0, 1.0)
 
         def __init__(self, tune, message):
-            self._message = message
             computed.append(message)
 
         def plan(self, step):
@@ -138,7 +138,8 @@ def test_a_proof_is_in_the_report_of_its_gains_and_is_computed_once(monkeypatch)
 
         def made(self, step, doubtful, tell, leave, show):
             asked.append(step)
-            return Verify.Result(passed=True, reason="numbers", steps=[made])
+            result = Verify.Result(passed=True, reason="numbers", steps=[made])
+            return result, (("gains", "kc 0.5"), *found_entries(result))
 
     monkeypatch.setattr(gains_page, "Proof", Made)
     gains._tuned = object()
@@ -152,5 +153,5 @@ def test_a_proof_is_in_the_report_of_its_gains_and_is_computed_once(monkeypatch)
     assert (asked, len(computed)) == ([-0.7], 1)
     assert live.told.status.startswith("proof passed")
     names = dict(subject.case.proof)
-    assert names["gains"].startswith(f"kc {subject.shaped(CALM.asked).gains.kc:.4f}")
+    assert names["gains"] == "kc 0.5"
     assert names["verdict"].startswith("passed") and subject.case.proof == live.told.proof
