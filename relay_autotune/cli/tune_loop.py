@@ -22,12 +22,12 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import (
     DONE,
@@ -54,13 +54,9 @@ from relay_autotune.nodes.shell import prefix, typed_for_parameter
 
 if TYPE_CHECKING:
     from relay_autotune.cli.loops import Loop
-    from relay_autotune.nodes.loop_client import LoopClient
-    from relay_autotune.nodes.tune_client import TuneClient
 
 # How long nodes that were found may take to know what they need for a tune [s].
 _READY_WITHIN = 30.0
-
-_Client = TypeVar("_Client", bound="LoopClient")
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -185,9 +181,6 @@ class Session:
         # A sensor that is slower than that needs a longer --wait.
         deadline = time.monotonic() + min(patience, max(options.wait, _READY_WITHIN))
         loop = loops[0]
-        if not options.web:
-            print("".join(f"{line}\n" for line in check_lines(loop.plan(), width())), end="",
-                  file=sys.stderr, flush=True)  # fmt: skip
         asks = (loop.has_own_nodes or options.dry_run) and not options.web
         if asks and not self._is_agreed(loop, deadline):
             return NOTHING_FOUND
@@ -218,12 +211,6 @@ class Session:
         if options.web:
             check_web(options)
 
-    def _joined(self, kind: Callable[..., _Client], *arguments: Any) -> _Client:
-        with Working("joining the ROS graph"):
-            found = kind(*arguments)
-        self.graph.enter_context(found)
-        return found
-
     def _looked_at(self, kind: Kind) -> list[Loop]:
         """Look at the loops, and ask for what is not given."""
         from relay_autotune.cli.loops import Loop, TopicLoop
@@ -233,7 +220,8 @@ class Session:
         options, ros = self.options, self.ros
 
         def client(space: str, robot: LoopClient | None = None) -> TuneClient:
-            return self._joined(TuneClient, space, options.node, ros, robot)
+            with Working("joining the ROS graph"):
+                return self.graph.enter_context(TuneClient(space, options.node, ros, robot))
 
         # The nodes of this process alone have a namespace of their own.
         own = options.namespace or f"tune_loop_{os.getpid()}"
@@ -242,7 +230,8 @@ class Session:
         if kind in (Kind.JOINT, Kind.OPENED):
             from relay_autotune.cli.joint_tune import JointLoop
 
-            robot = self._joined(LoopClient, own, "", options.node, ros)
+            with Working("joining the ROS graph"):
+                robot = self.graph.enter_context(LoopClient(own, "", options.node, ros))
             return [JointLoop(robot, options, client)]
         given = options.namespace or ""
         spaces = given.split(",") if options.web else [given]
@@ -275,6 +264,8 @@ class Session:
         """Show the plan of a tune, and return whether it is to start; a dry run only shows it."""
         options, may_go_back = self.options, loop.answers.may_go_back
         while True:
+            if plan := loop.plan():
+                print("\n".join(check_lines(plan, width())), file=sys.stderr, flush=True)
             with Working("looking at the loop"):
                 found = loop.check(deadline)
             if not self._may_start(loop, found):
@@ -312,13 +303,11 @@ class Session:
 
         signals, shown = self.signals, Shown(sys.stderr, live=sys.stderr.isatty())
         shown.say(f"tune of {loop.title}; Ctrl-C cancels it")
-        # Signals must work even while writing to standard error would block.
-        wait_again = never_wait_for(sys.stderr.fileno())
-        try:
+        with ExitStack() as stack:
+            # Signals must work even while writing to standard error would block.
+            stack.callback(never_wait_for(sys.stderr.fileno()))
             loop.tune(shown, signals.came, deadline)
             shown.clear()
-        finally:
-            wait_again()
 
     def _concluded(self, loop: Loop) -> int:
         """Show the result, and hand over the gains."""

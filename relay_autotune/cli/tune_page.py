@@ -92,8 +92,6 @@ class TunePage:
                 f"the page is at {url} until Ctrl-C; nothing is commanded before a tune is "
                 "started there",
             )
-            if len(self._loops) == 1:
-                return self._loops[0].run(interrupted)
             with ThreadPoolExecutor(len(self._loops)) as pool:
                 running = [pool.submit(loop.run, interrupted) for loop in self._loops]
                 # Only the main thread hears signals, and only between its own steps.
@@ -120,12 +118,11 @@ class _LoopOnPage:
         self._commands_shown: Callable[[], AbstractContextManager[None]] = nullcontext
         self._interrupted: list[int] = []
         self._gains = GainsPage(loop, self._live, page, number, self._is_to_end)
-        # About the running tune: messages of the cycles, K_u after each, signals and wishes to end
-        # it, how many of the signals are among these, and what is done at its first feedback.
+        # About the running tune: messages of the cycles, K_u after each, signals or a wish to end
+        # it, and what is done at its first feedback.
         self._cycles: list[Any] = []
         self._ultimate: dict[int, EstimatedQuantity] = {}
         self._ends: list[int] = []
-        self._heeded = 0
         self._at_first: Callable[[], object] | None = None
 
     def run(self, interrupted: list[int]) -> int:
@@ -201,7 +198,6 @@ class _LoopOnPage:
             lines = loop.plan()
             result = loop.check()
             lines += loop.checklist(result)
-            self._live.tell(limits=tuple(self._options.within or ()))
             if not self._client.succeeded:
                 refusal = f"refused: {result.reason}"
                 named = (
@@ -227,6 +223,7 @@ class _LoopOnPage:
             told = "; ".join(lacking)
             raise SelectionError(f"fill in the plan first (Start a tune): {told}")
         self._loop.before_tune()
+        self._live.tell(limits=tuple(self._options.within or ()))
 
     def _tune(self, wish: PageCommand) -> int:
         """Tune until the result is there."""
@@ -239,13 +236,13 @@ class _LoopOnPage:
             return DONE
         live.forget_questions()
         self._cycles.clear()
-        self._ultimate, self._ends, self._heeded = {}, [], len(self._interrupted)
+        self._ultimate, self._ends = {}, []
         live.show("model", None)
         live.tell(
             phase="tuning", state="", status="asking for the tune", tone="", progress=0.0,
             elapsed=0.0, cycles=(), process="", result=(), tuned=-1,
             began=time.strftime("%H:%M"), setpoint=math.nan, levels=(),
-            window=(live.now, 0.0), limits=tuple(self._options.within or ()),
+            window=(live.now, 0.0),
         )  # fmt: skip
         with ExitStack() as stack:
             # Only once it has begun: see TuneClient.command_watch.
@@ -260,11 +257,8 @@ class _LoopOnPage:
             say(PROGRAM, refused)
         if not tune.is_started:
             # What the page shows is still that of the tune before.
-            live.rest(
-                f"refused: {result.reason}", good=False, cycles=before.cycles,
-                process=before.process, result=before.result, tuned=before.tuned,
-                began=before.began,
-            )  # fmt: skip
+            live.tell(**vars(before))
+            live.rest(f"refused: {result.reason}", good=False)
             return NOTHING_FOUND
         lines = tune.lines(Paint())
         print("\n".join(lines), flush=True)
@@ -278,7 +272,6 @@ class _LoopOnPage:
             cycles = len(live.told.cycles)
             live.tell(process=self._show(result.transfer_function, cycles))
             self._add_subject(tune)
-        done = client.succeeded and tune.has_gains
         if tune.has_gains:
             self._loop.after_tune()
         self._gains.look_after_tune(tune)
@@ -286,8 +279,8 @@ class _LoopOnPage:
             # What the plant does now matters more than the tune.
             live.tell(window=())
         ended = "; ".join(filter(None, (f"no gains: {result.reason}", tune.left)))
-        live.rest("the tune is complete" if done else ended, good=done)
-        return tune.status(found=done)
+        live.rest("the tune is complete" if tune.is_complete else ended, good=tune.is_complete)
+        return tune.status()
 
     # The progress of a tune: a `Face`.
 
@@ -348,12 +341,9 @@ class _LoopOnPage:
         self._live.show("model", of_running(found, record, list(ultimate.items())))
 
     def tick(self) -> None:
-        """Heed what was wished or signalled since the last call."""
+        """Heed what was wished or signalled."""
         # SIGHUP, as a wish that is repeated does not leave the tune alone.
-        if self._live.abort.is_set() and not self._ends:
-            self._ends.append(signal.SIGHUP)
-        self._ends += self._interrupted[self._heeded :]
-        self._heeded = len(self._interrupted)
+        self._ends[:] = self._interrupted or [signal.SIGHUP] * self._live.abort.is_set()
         self._terminal.tick()
 
     def say(self, text: str) -> None:
