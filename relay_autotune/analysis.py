@@ -35,6 +35,8 @@ from relay_autotune.identification.methods import (
     identify,
     identify_jointly,
     method_named,
+    require_used,
+    used_by,
 )
 from relay_autotune.identification.result import Identification
 from relay_autotune.process.structures import FOPDT
@@ -76,7 +78,8 @@ class Task:
     :param known: known values of the process.
     :param options: design options of the controller; noise, amplitude and sampling period come
         from the record if they are not given.
-    :raises RelayAutotuneError: if method or rule are unknown; the message lists the known ones.
+    :raises RelayAutotuneError: if method or rule are unknown, or the method does not use a value
+        that is known; the message lists those that there are, or that do.
     """
 
     method: str = DEFAULT_METHOD
@@ -86,6 +89,7 @@ class Task:
 
     def __post_init__(self) -> None:
         method_named(self.method)
+        require_used(self.method, self.known)
         rule_named(self.rule)
 
     @property
@@ -379,6 +383,10 @@ def _first(rule: str) -> tuple[str, ...]:
     return (rule, *(name for name in RULES if name != rule))
 
 
+def _as_fopdt(known: Known) -> Known:
+    return replace(used_by(DEFAULT_METHOD, known), structure=FOPDT.name)
+
+
 def _simple(
     records: Sequence[Record], known: Known, chosen: Identification
 ) -> TransferFunction | None:
@@ -386,7 +394,7 @@ def _simple(
     if chosen.structure == FOPDT.name:
         return chosen.model
     try:
-        found = identify_jointly(records, DEFAULT_METHOD, replace(known, structure=FOPDT.name))
+        found = identify_jointly(records, DEFAULT_METHOD, _as_fopdt(known))
     except RelayAutotuneError:
         return None
     return found.model
@@ -425,8 +433,9 @@ def _others(record: Record, task: Task, chosen: Identification) -> list[Identifi
 
     The first is the best FOPDT, which most rules need.
     """
-    wanted = [(DEFAULT_METHOD, replace(task.known, structure=FOPDT.name))]
-    wanted += [(m, task.known) for m in METHODS if m not in (task.method, DEFAULT_METHOD)]
+    others = [m for m in METHODS if m not in (task.method, DEFAULT_METHOD)]
+    wanted = [(DEFAULT_METHOD, _as_fopdt(task.known))]
+    wanted += [(m, used_by(m, task.known)) for m in others]
     if chosen.method == DEFAULT_METHOD and chosen.structure == FOPDT.name:
         wanted = wanted[1:]
     found = []

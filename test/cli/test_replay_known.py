@@ -17,8 +17,9 @@ from relay_autotune.analysis import analyse, analyse_jointly
 from relay_autotune.bag.definitions import EXPERIMENT, Definition
 from relay_autotune.bag.writer import BagWriter, Topic
 from relay_autotune.cli import replay
-from relay_autotune.errors import RelayAutotuneError
-from relay_autotune.identification.known import Known
+from relay_autotune.errors import IdentificationError, RelayAutotuneError
+from relay_autotune.identification.known import NOTHING, Known
+from relay_autotune.identification.methods import METHODS, USED_BY, identify
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record, RelaySettings
 
@@ -67,6 +68,36 @@ def test_a_fact_that_cannot_be_is_one_line(tmp_path, capsys):
     status, found, err = run(capsys, "--dead-time", "-1", tmp_path / "none")
     assert (status, found) == (2, [])
     assert err == "replay: --dead-time is -1, expected at least 0 s\n"
+
+
+@pytest.mark.parametrize(
+    ("fact", "method", "uses"),
+    [
+        ("--gain 5", "waveform", "wang_biased, wang_unbiased, chang, atv, fourier"),
+        ("--dead-time 60", "waveform", "chang, atv, li, thyagarajan, luyben_step, fourier"),
+        ("--loss huber", "chang", "waveform"),
+        ("--gain 5", "li", "wang_biased, wang_unbiased, chang, atv, fourier"),
+    ],
+)
+def test_a_fact_that_the_method_does_not_use_is_refused(tmp_path, capsys, fact, method, uses):
+    status, found, err = run(capsys, *fact.split(), "--method", method, tmp_path / "none")
+    name = fact.split()[0].removeprefix("--").replace("-", "_")
+    assert (status, found) == (2, [])
+    assert err == (
+        f"replay: {name} is not used by the method {method}: leave it out, or name a method that "
+        f"uses it: {uses}\n"
+    )
+
+
+@pytest.mark.parametrize("method", ["chang", "wang_unbiased"])
+def test_what_a_method_is_declared_not_to_use_changes_nothing(method):
+    record, given = unbiased(), Known(3.0, 4.0, "lag_n", 3, "huber")
+    first = METHODS[method](record, NOTHING).values
+    for name in (name for name, methods in USED_BY.items() if method not in methods):
+        known = replace(NOTHING, **{name: getattr(given, name)})
+        np.testing.assert_array_equal(METHODS[method](record, known).values, first)
+        with pytest.raises(IdentificationError, match=f"{name} is not used by the method"):
+            identify(record, method, known)
 
 
 @pytest.mark.parametrize("one_bag", [True, pytest.param(False, marks=pytest.mark.nightly)])

@@ -277,7 +277,7 @@ def test_the_flags_of_the_next_command_give_what_the_identifier_was_asked_for() 
     assert flags_of(DEFAULTS) == ""
     told = {
         "method": "chang", "rule": "imc", "known_gain": 1.65, "known_dead_time": 0.5,
-        "structure": "lag_n", "order": 3, "loss": "huber", "controller": "pi", "ms": 1.6,
+        "structure": "lag_n", "order": 3, "loss": "squares", "controller": "pi", "ms": 1.6,
         "mt": 1.5, "law": "pid_controller", "setpoint_weight": 0.5,
         "sample_period": 0.01, "loop_delay": 0.02, "noise_share": 0.2, "filter_ratio": 8.0,
         "closed_loop_time": 2.0, "phase_peak": math.radians(-130.0), "resonance": 3.0,

@@ -101,6 +101,9 @@ def test_li_takes_the_last_two_experiments_and_facts_reach_the_methods(
     refused = node.set_parameters([Parameter("known_gain", value=0.0)])[0]
     assert not refused.successful
     assert "not zero" in refused.reason
+    refused = node.set_parameters([Parameter("loss", value="huber")])[0]
+    assert not refused.successful
+    assert "loss is not used by the method chang" in refused.reason
     assert {entry.name for entry in KNOWN} <= {entry.name for entry in PARAMETERS}
 
 

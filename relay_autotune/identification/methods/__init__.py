@@ -43,6 +43,14 @@ JOINT_METHODS: dict[str, JointMethod] = {
 }
 ONLY_JOINT = ("li",)
 DEFAULT_METHOD = "waveform"
+# The methods that use a known value; the others find it themselves, or have no place for it.
+USED_BY: dict[str, tuple[str, ...]] = {
+    "gain": ("wang_biased", "wang_unbiased", "chang", "atv", "fourier"),
+    "dead_time": ("chang", "atv", "li", "thyagarajan", "luyben_step", "fourier"),
+    "structure": ("waveform", "chang", "atv", "li", "thyagarajan", "luyben_step", "fourier"),
+    "order": ("waveform", "chang", "atv", "li", "thyagarajan", "fourier"),
+    "loss": ("waveform",),
+}
 
 
 def method_named(name: str) -> Method:
@@ -51,6 +59,32 @@ def method_named(name: str) -> Method:
     :raises IdentificationError: if there is none of that name; the message lists the names.
     """
     return look_up(METHODS, name, "method", IdentificationError)
+
+
+def used_by(method: str, known: Known) -> Known:
+    """Return what of the known values a method uses.
+
+    :param method: one of ``METHODS``.
+    :param known: what is known of the process beforehand.
+    """
+    return Known(**{name: getattr(known, name) for name in USED_BY if method in USED_BY[name]})
+
+
+def require_used(method: str, known: Known) -> None:
+    """Refuse a known value that a method would ignore.
+
+    :param method: one of ``METHODS``.
+    :param known: what is known of the process beforehand.
+    :raises IdentificationError: if there is one; the message lists the methods that use it.
+    """
+    used = used_by(method, known)
+    for name, methods in USED_BY.items():
+        value = getattr(known, name)
+        if value == value and value != getattr(used, name):
+            raise IdentificationError(
+                f"{name} is not used by the method {method}: leave it out, or name a method that "
+                f"uses it: {', '.join(methods)}"
+            )
 
 
 def identify(
@@ -67,10 +101,13 @@ def identify(
     :param record: the experiment.
     :param method: one of ``METHODS``.
     :param known: what is known of the process beforehand.
-    :raises IdentificationError: if the method is unknown or the record does not give a model.
+    :raises IdentificationError: if the method is unknown, or does not use a value that is known,
+        or the record does not give a model.
     :raises RecordError: if it is not a record.
     """
-    return method_named(method)(one_record(record, "identify"), known)
+    identified = method_named(method)
+    require_used(method, known)
+    return identified(one_record(record, "identify"), known)
 
 
 def identify_jointly(
@@ -81,12 +118,13 @@ def identify_jointly(
     :param records: the experiments.
     :param method: one of ``JOINT_METHODS``.
     :param known: what is known of the process beforehand.
-    :raises IdentificationError: if the method does not take several records, or they do not give
-        a model.
+    :raises IdentificationError: if the method does not take several records, or does not use a
+        value that is known, or they do not give a model.
     """
     if method not in JOINT_METHODS:
         raise IdentificationError(
             f"the method {method!r} does not take several records together; these do: "
             f"{', '.join(JOINT_METHODS)}"
         )
+    require_used(method, known)
     return JOINT_METHODS[method](records, known)

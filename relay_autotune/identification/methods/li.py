@@ -303,7 +303,7 @@ def _identified(
         METHOD,
         Estimate.of(fit.model, fit.values, fit.covariance if known_scatter else None),
         Reading(fit.values, None, averaged).quantile,
-        warnings=(*remarks, *_remarks(cycles, known, fit)),
+        warnings=(*remarks, *_remarks(cycles, known.dead_time, fit)),
     )
 
 
@@ -331,11 +331,9 @@ def _cycle(test: RelayTest, read: Reading) -> SymmetricCycle:
     return SymmetricCycle(period, amplitude, test.settings.amplitude, level, added, errors)
 
 
-def _remarks(cycles: Sequence[SymmetricCycle], known: Known, fit: JointFit) -> list[str]:
+def _remarks(cycles: Sequence[SymmetricCycle], dead_time: float, fit: JointFit) -> list[str]:
     """Return how well the tests agree, and what the paper's describing function gives."""
     found = []
-    if not math.isnan(known.gain):
-        found.append("the gain given was not used: li finds it from the tests")
     if fit.misfit > AGREEMENT:
         found.append(
             f"the tests do not agree with {model_text(fit.model)}: periods and amplitudes miss it "
@@ -346,8 +344,6 @@ def _remarks(cycles: Sequence[SymmetricCycle], known: Known, fit: JointFit) -> l
     return found + literally(
         "the equations of the describing function",
         fit.model,
-        lambda: fit_jointly(
-            fit.model, cycles, known.dead_time, exact=False, sign=sign
-        ).values.tolist(),
+        lambda: fit_jointly(fit.model, cycles, dead_time, exact=False, sign=sign).values.tolist(),
         fit.values,
     )
