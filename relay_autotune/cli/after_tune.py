@@ -239,10 +239,8 @@ class AfterTune(Tuned):
             the commands that follow, each with its purpose.
         """
         options, loop, gains = self.options, self.loop, self.gains
-        steps = list[tuple[str, str]]()
         proven, against = self._tried()
-        if loop.proves and not against:
-            steps = self._own_controller()
+        steps = self._own_controller() if loop.proves and not against else []
         first = _Written(gains, exports_of(gains.law)[0], against or self.doubt)
         written, file = first, options.export
         if loop.proves and not (file or options.yes) and sys.stdin.isatty():

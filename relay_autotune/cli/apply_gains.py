@@ -252,15 +252,14 @@ def verified(
 
 
 def _question(options: argparse.Namespace, step: float) -> str:
+    if options.no_verify:
+        return str(options.question)
     steps = [f"a step of the set-point by {step:g} y"] if step else []
     if options.load:
         steps.append(f"a step of the load by {options.load:g} u")
-    what = "verify those in force" if options.verify_only else "apply the new gains"
-    if options.no_verify:
-        return str(options.question)
-    joined = " and ".join(steps)
-    return (f"{what} with {joined}?" if options.verify_only else f"{what}, and verify them with "
-            f"{joined}?").capitalize()  # fmt: skip
+    new = "Apply the new gains, and verify them"
+    what = "Verify those in force" if options.verify_only else new
+    return f"{what} with {' and '.join(steps)}?"
 
 
 def _numbers(gains: Controller | None) -> str:

@@ -53,9 +53,9 @@ def run(rig: Rig, *arguments: str) -> tuple[int, str, str]:
 
 
 def error(said: str) -> str:
-    """Return the one line of an error, after those that say what is looked for."""
+    """Return the one line of an error, after those that say what is done or looked for."""
     *looked, last = said.splitlines()
-    assert all(line.startswith("looking for ") for line in looked), said
+    assert all(line.startswith(("joining ", "looking for ")) for line in looked), said
     return last
 
 
