@@ -115,7 +115,7 @@ def checks_table(checks: Iterable[Check]) -> str:
     ]
     for check in checks:
         limits = (limit_text(check, limit) for limit in (check.doubtful, check.failed))
-        cells = (f"`{check.name}`", check.what, *limits, check.remedy)
+        cells = (f"{check.title} `{check.name}`", check.what, *limits, check.remedy)
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 

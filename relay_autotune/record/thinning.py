@@ -62,10 +62,11 @@ def thinned(record: Record) -> Record:
         often = changes.size > _MOST_CHANGES
         begun = float(record.time[low] - record.time[0])
         said = (
-            f", from {begun:.6g} s to {begun + part.duration:.6g} s alone: it moves too fast for "
-            "means of more samples; choose another part with --start and --end"
+            f", from {begun:.6g} s to {begun + part.duration:.6g} s alone: the measurement moves "
+            "too fast for means of more; choose another part with --start and --end"
         )
     begins = _begins(part, changes[:0] if often else changes, size)
+    means = f", means of {len(part) / begins.size:.3g} each" if size > 1 else ""
     return _averaged(
         part,
         begins,
@@ -73,8 +74,7 @@ def thinned(record: Record) -> Record:
             n,
             record.interval,
             record.noise_std if record.noise_std > 0.0 else roughness(record.measurement),
-            f"of {n} samples {begins.size} are used, means of "
-            f"{len(part) / begins.size:.3g} each{said}",
+            f"of {n} samples {begins.size} are used{means}{said}",
         ),
         often=often,
     )

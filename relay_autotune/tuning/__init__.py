@@ -153,7 +153,7 @@ def judged(task: DesignTask, found: Designed) -> Gains:
 
     law = task.law(weighted(found.controller))
     controller, performance = law.gains, Loop(law, task.held(task.model)).performance()
-    bare, warnings = None, cautions(performance, task)
+    bare, warnings = None, cautions(controller, performance, task)
     if options.law:
         reason += f"; for {options.law} every {options.sample_period:g} s"
         own = None

@@ -210,9 +210,12 @@ class DesignTask:
         return self.set_of(self.models, self.errors) if self.models else None
 
 
-def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:
+def cautions(
+    controller: Controller, performance: Performance, task: DesignTask
+) -> tuple[str, ...]:
     """Return what the user must know before using gains, a sentence each.
 
+    :param controller: the gains.
     :param performance: of the gains on the model.
     :param task: what was asked for.
     """
@@ -233,7 +236,7 @@ def cautions(performance: Performance, task: DesignTask) -> tuple[str, ...]:
         found.append(
             f"the noise alone moves the command by {noise:.3g} u (standard deviation), "
             f"{100.0 * noise / options.amplitude:.0f} % of half the command's range; filter the "
-            "measurement, or ask for controller pi"
+            f"measurement{', or ask for controller pi' if controller.td else ''}"
         )
     return (*found, task.too_slow) if task.too_slow else tuple(found)
 

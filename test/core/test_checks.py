@@ -137,6 +137,14 @@ def test_an_actuator_that_pulls_less_than_it_pushes_is_told():
     assert max(gains) > 0.95 * MODEL.gain
 
 
+def test_unequal_effects_that_are_shown_as_equal_are_no_news():
+    found = identify_waveform(_record(0.995, noise=1e-4), Known(structure="fopdt"))
+    above, below = found.effects
+    assert above - below == pytest.approx(0.005, rel=0.2)
+    assert found.ci95_high[0] < 1.001 * found.model.gain
+    assert not any("not linear" in told for told in found.warnings)
+
+
 def test_unequal_effects_within_the_interval_of_the_gain_are_no_news():
     found = identify_waveform(_record(0.95, noise=0.05), Known(structure="fopdt"))
     above, below = found.effects

@@ -380,6 +380,11 @@ def test_a_loop_slower_than_what_the_record_shows_is_doubtful(record, gains, sho
     s = 1j * math.pi / last
     assert beyond.value == pytest.approx(1.0 / abs(found.model(s) * gains(s)), rel=1e-6)
     assert beyond.result is result
+    if result is Result.DOUBTFUL:
+        needed = float(beyond.sentence.split(", ")[1].removesuffix(" s are needed"))
+        for longer, gain in ((0.97, False), (1.03, True)):
+            s = 1j * math.pi / (longer * needed)
+            assert (abs(found.model(s) * gains(s)) > 1.0) == gain
 
 
 @pytest.mark.parametrize(("share", "result"), [(0.3, Result.PASSED), (0.7, Result.DOUBTFUL)])

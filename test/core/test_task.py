@@ -54,12 +54,13 @@ def test_a_held_sample_lags_by_half_a_period():
     assert DesignTask(model=IPDT.build((1.0, 1.0))).options.added_delay == 0.0
 
 
-def test_a_command_full_of_noise_is_told_with_the_option_that_helps():
+@pytest.mark.parametrize(("td", "ends"), [(9.0, ", or ask for controller pi"), (0.0, "")])
+def test_a_command_full_of_noise_is_told_with_the_option_that_helps(td, ends):
     process = TransferFunction(0.6, time_constants=(40.0, 12.0), dead_time=8.0)
-    asked = DesignOptions(sample_period=0.1, noise_std=0.5, amplitude=1.0)
-    task = DesignTask(model=process, options=asked)
-    (told,) = cautions(task.loop(Controller(0.5, 60.0, 9.0, 0.5)).performance(), task)
-    assert told.endswith("filter the measurement, or ask for controller pi")
+    asked = DesignOptions(sample_period=0.1, noise_std=5.0, amplitude=1.0)
+    task, controller = DesignTask(model=process, options=asked), Controller(0.5, 60.0, td, 0.5)
+    (told,) = cautions(controller, task.loop(controller).performance(), task)
+    assert told.endswith(f"filter the measurement{ends}")
     assert DesignOptions(controller="pi").controller == "pi"
 
 
@@ -67,5 +68,6 @@ def test_a_command_full_of_noise_is_told_with_the_option_that_helps():
 def test_a_period_in_milliseconds_is_asked_about(period, asks):
     process = TransferFunction(0.6, time_constants=(40.0, 12.0), dead_time=8.0)
     task = DesignTask(model=process, options=DesignOptions(sample_period=period))
-    said = cautions(task.loop(Controller(0.5, 60.0)).performance(), task)
+    controller = Controller(0.5, 60.0)
+    said = cautions(controller, task.loop(controller).performance(), task)
     assert any("is the sampling period in seconds?" in each for each in said) is asks

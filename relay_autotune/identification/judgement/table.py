@@ -27,6 +27,8 @@ from relay_autotune.verdict import Check, Measured, not_known
 _FAR_ABOVE = 1.25
 # Frequency at which the integral action alone is left, times the record's duration [rad].
 _LOW = 1e-6
+# How much longer than the record a record is that shows half a period of any loop.
+_LONGER = 1e4
 # Share of bad ones from which gains are more likely bad than good.
 _LIKELY_BAD = 0.5
 
@@ -103,9 +105,12 @@ def _beyond(evidence: Evidence) -> Measured | None:
     loop, shown = evidence.loop, evidence.shown
     if loop is None or not shown > 0.0:
         return None
-    s = np.array([1j * math.pi / shown])
-    gain = float(abs(evidence.found.model(s) * loop.controller(s))[0])
-    return Measured(1.0 / gain) if gain > 0.0 else None
+    times = shown * np.geomspace(1.0, _LONGER, 1000)
+    s = 1j * (math.pi / times)
+    gain = abs(evidence.found.model(s) * loop.controller(s))
+    needed = float(np.max(times[gain < 1.0], initial=shown))
+    detail = f"{digits(shown, 3)} s after the first change of the command, {digits(needed, 3)} s"
+    return Measured(1.0 / float(gain[0]), detail) if gain[0] > 0.0 else None
 
 
 def _direction(evidence: Evidence) -> Measured | None:
@@ -269,9 +274,8 @@ LOOP_CHECKS = (
         doubtful=1.0,
         # Feedback of a tenth changes nothing that the record shows by more than a tenth.
         failed=10.0,
-        sentence="the record is short for so slow a loop, whose gain is 1/{value} at the lowest "
-        "frequency of which it shows half a period",
-        remedy="record for longer after the first change of the command",
+        sentence="the record is too short for so slow a loop: it ends {detail} are needed",
+        remedy="record for longer",
         measure=_beyond,
     ),
     Check(

@@ -285,11 +285,12 @@ def _warnings(
             found.append(
                 f"{which}{record.lost_samples} samples were lost on the way; check the network"
             )
-    above, below = fit.problem.effects(fit.state.coefficients)
-    if fit.problem.unequal and not abs(above - 1.0) <= known_to:
+    effects = fit.problem.effects(fit.state.coefficients)
+    above, below = (f"{effect:.2f}" for effect in effects)
+    if above != below and not abs(effects[0] - 1.0) <= known_to:
         found.append(
-            f"commands above the first one act {above:.2f} times as strongly as in the model, "
-            f"those below it {below:.2f} times: the process is not linear, and the gains hold on "
+            f"commands above the first one act {above} times as strongly as in the model, "
+            f"those below it {below} times: the process is not linear, and the gains hold on "
             "both sides; the weaker direction sets how fast the loop can be"
         )
     if fit.problem.play:
