@@ -53,6 +53,7 @@ from relay_autotune.process.structures import (
     structure_named,
 )
 from relay_autotune.process.transfer_function import TransferFunction, process_text
+from relay_autotune.quantities import Quantity
 from relay_autotune.result import Shaping
 from relay_autotune.text import digits
 from relay_autotune.tuning import DEFAULT_RULE, RULES, design, task_of_model
@@ -87,6 +88,8 @@ def model_of(options: argparse.Namespace) -> TransferFunction:
             "no model: give --gain, --time-constants and --dead-time, or a JSON document; "
             "tune --help has examples"
         )
+    if options.document is None and options.experiment is not None:
+        raise SelectionError("--experiment is of a document, and the model is given by flags")
     if options.document is not None:
         given = _from_document(options.document, options.experiment)
     try:
@@ -116,6 +119,12 @@ def _built(given: dict[str, Any]) -> TransferFunction:
     if denominator is not None and "time_constants" in given and "gain" in given:
         integrators = len(denominator) - 1 - len(lags)
         return TransferFunction(gain, zeros, lags, integrators, dead_time, structure or GENERAL)
+    if unknown := [repr(name) for name in given if name not in _FLAGS]:
+        raise SelectionError(f"unknown {', '.join(unknown)}; known: {', '.join(_FLAGS)}")
+    for name, values in {"dead_time": [dead_time], "time_constants": lags, "zeros": zeros}.items():
+        for value in values:
+            if problem := Quantity(name, 0.0, "s").problem(abs(value)):
+                raise SelectionError(problem)
     if numerator is not None or denominator is not None:
         if numerator is None or denominator is None:
             raise SelectionError("numerator and denominator belong together: give both")
@@ -172,6 +181,8 @@ def _from_document(name: str, experiment: int | None) -> dict[str, Any]:
         raise SelectionError(f"{name} holds a JSON {type(found).__name__}, expected an object")
     if "experiments" in found:
         return _selected(name, found, experiment)
+    if experiment is not None:
+        raise SelectionError(f"{name} holds no experiments: leave out --experiment")
     if isinstance(found.get("model"), dict):
         found = found["model"]
     if not {"gain", "denominator"} & found.keys():

@@ -277,6 +277,9 @@ REFUSED = [
     (FOPDT + " --output there", 2, "--output is for --export"),
     (FOPDT + " --table --export yaml", 2, "leave out --table"),
     (FOPDT + " --sample-period 1 --export pid_controller --dof 2nd/", 2, "'2nd/' is not a name"),
+    ("--gain 1 --time-constants 1e-300", 2, "time_constants is 1e-300, expected a time from"),
+    ("--gain 1 --time-constants 1 --dead-time 1e300", 2, "dead_time is 1e+300, expected a time"),
+    (FOPDT + " --experiment 3", 2, "--experiment is of a document, and the model is given by"),
     (FOPDT + " there.json", 2, "given twice"),
     ("there.json", 2, "there.json cannot be read: No such file"),
     (FOPDT + " --rule lcmax", 1, "3 or more equal lags, found fopdt"),
@@ -310,6 +313,10 @@ def test_refusals_are_one_line_and_no_gains(flags, status, said, capsys):
         ('{"gain": 2, "time_constants": [true]}', "time_constants must be a number"),
         ('{"gain": null, "time_constants": [1]}', "gain must be a number, found None"),
         ('{"numerator": 1, "denominator": [1, 1]}', "numerator must be a list"),
+        (
+            '{"gain": 1, "time_constants": [20], "deadtime": 10}',
+            "unknown 'deadtime'; known: gain, time_constants, zeros, dead_time, ",
+        ),
         ('{"experiments": []}', "no experiment with a model"),
         ('{"experiments": [{"selected": null, "models": []}]}', "no experiment with a model"),
     ],
@@ -321,6 +328,13 @@ def test_documents_that_hold_no_model(text, said, tmp_path, capsys):
     assert (status, out) == (2, "")
     assert said in err
     assert err.count("\n") == 1
+
+
+def test_a_document_without_experiments_has_none_to_choose(tmp_path, capsys):
+    path = tmp_path / "model.json"
+    path.write_text('{"gain": 1, "time_constants": [20]}')
+    status, _, err = run(capsys, str(path), "--experiment", "1")
+    assert (status, err) == (2, f"tune: {path} holds no experiments: leave out --experiment\n")
 
 
 def test_of_several_experiments_one_is_chosen(tmp_path, capsys):
