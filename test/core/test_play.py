@@ -10,10 +10,12 @@ import pytest
 
 from relay_autotune import Record, TransferFunction, identify
 from relay_autotune.analysis import analyse
+from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.waveform.problem import problem_of
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.process.virtual_process import Actuator, VirtualProcess
+from relay_autotune.process.virtual_process import Actuator, Disturbances, VirtualProcess
 from relay_autotune.quantities import NORMAL_95
 
 PROCESS = TransferFunction.fopdt(1.0, 1.0, 0.3)
@@ -84,7 +86,22 @@ def test_no_play_is_found_where_there_is_none():
 def test_play_is_no_term_where_the_command_cannot_show_it(levels, shown):
     record = record_of(levels)
     problem = problem_of([(record.time, record.measurement, record.drive())], FOPDT)
-    assert (problem.most_play > 0.0) is shown
+    assert all((problem.most_play(held=held) > 0.0) is shown for held in (False, True))
+
+
+@pytest.mark.parametrize(("band", "noise"), [(0.04, 0.005), (0.04, 0.01), (0.0, 0.005)])
+def test_a_relay_whose_first_cycle_is_smaller_shows_its_play(band, noise):
+    """K_u was 2 % off for a play of 2 % of the swing, and nothing was said of it."""
+    plant = VirtualProcess(PROCESS, disturbances=Disturbances(noise_std=noise * 0.52), seed=7)
+    acting = Actuator(0.0, dead_band=band)
+    tune = RelayExperiment(ExperimentParameters(amplitude=1.0), 0.0, from_small=True)
+    for k in range(2000):
+        plant.command(acting.move(tune.step(PERIOD * k, plant.measure(PERIOD * k))))
+        if tune.finished:
+            break
+    found = identify(tune.record())
+    assert found.play == pytest.approx(band, abs=0.01)
+    assert found.ultimate_gain == pytest.approx(ultimate_point(PROCESS).gain, rel=0.01)
 
 
 def test_the_interval_of_the_ultimate_gain_holds_both_sides():

@@ -260,7 +260,9 @@ class FitContext:
         if problem.friction and problem.dry_friction(state.coefficients) < self.least_friction:
             return None
         if problem.play and not (
-            self.least_friction <= problem.play_of(state.coefficients) <= problem.most_play
+            self.least_friction
+            <= problem.play_of(state.coefficients)
+            <= problem.most_play(held=self.held)
         ):
             return None
         shortest, _ = time_scales(self.problem)
@@ -360,7 +362,7 @@ class FitContext:
             "relaxation": not rested,
             "past": not rested and self.problem.past_is_open,
             "unequal": self.problem.acts_both_ways,
-            "play": self.problem.most_play >= self.least_friction,
+            "play": self.problem.most_play(held=self.held) >= self.least_friction,
             "load": self.loads and len(self.problem.bounds) == 1,
             "friction": self.held and bool(self.problem.motions),
         }

@@ -102,15 +102,18 @@ class Problem:
             for u, part in zip(self.inputs, self.experiments, strict=True)
         )
 
-    @cached_property
-    def most_play(self) -> float:
-        """Largest play that the commands show [u]; 0: they show none.
+    def most_play(self, *, held: bool) -> float:
+        """Return the largest play that the commands show [u]; 0: they show none.
 
-        Each command has to come to one level from above and from below: between two levels alone,
-        play only makes the moves smaller, as a smaller gain does. And all moves have to cross it.
+        Each command has to come to one level from above and from below, or to go ways of several
+        lengths: between two levels alone, play only makes the moves smaller, as a smaller gain
+        does. And all moves have to cross it.
+
+        :param held: True: a relay held the process. In other tests a way of another length may
+            lead to where the process has another gain.
         """
         return min(
-            _shown_play(u, self.time[part])
+            _shown_play(u, self.time[part], held=held)
             for u, part in zip(self.inputs, self.experiments, strict=True)
         )
 
@@ -345,18 +348,23 @@ def _turns(u: Input) -> PiecewiseConstant:
     return PiecewiseConstant(u.times[moved], moves[moved], 0.0)
 
 
-def _shown_play(u: Input, time: FloatArray) -> float:
+def _shown_play(u: Input, time: FloatArray, *, held: bool) -> float:
     """Return the least way of a command between two turns, where that shows a play [u]; or 0."""
     if not isinstance(u, PiecewiseConstant):
         return 0.0
     turns = _turns(u)
     # Of the last move little is seen.
     times = turns.times[(turns.times >= time[0]) & (turns.times < time[-1])][:-1]
-    level, direction = u(times), turns(times)
-    if not np.intersect1d(level[direction > 0.0], level[direction < 0.0]).size:
+    if not times.size:
         return 0.0
+    level, direction = u(times), turns(times)
     ends = level[np.append(np.diff(direction) != 0.0, True)]
-    return float(np.abs(np.diff(ends, prepend=u.initial)).min())
+    ways = np.abs(np.diff(ends, prepend=u.initial))
+    # Where in its play the process rested before the first way is not known.
+    differ = held and not np.allclose(ways[1:], ways[-1])
+    if not (differ or np.intersect1d(level[direction > 0.0], level[direction < 0.0]).size):
+        return 0.0
+    return float(ways.min())
 
 
 def problem_of(
