@@ -11,7 +11,9 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 
-_MOST_STEPS = 100
+_MOST_STEPS = 200
+# Relative accuracy of a root: two steps between neighbouring numbers.
+EXACT = 2.0 * float(np.finfo(float).eps)
 
 
 def minimum_near(
@@ -43,49 +45,51 @@ def root(
     :param high: the other.
     :param tolerance: of a root near zero, where the relative one of the numbers would not do.
     """
-    from scipy.optimize import brentq
-
     at_low, at_high = function(low), function(high)
     if at_low * at_high >= 0.0:
         return low if abs(at_low) <= abs(at_high) else high
-    return float(brentq(function, low, high, xtol=tolerance, rtol=1e-15, maxiter=1000))
+
+    def of_cell(place: FloatArray) -> FloatArray:
+        return np.array([function(float(place[0]))])
+
+    return float(roots(of_cell, np.array([low]), np.array([high]), tolerance)[0])
 
 
 def roots(
     function: Callable[[FloatArray], FloatArray],
     low: FloatArray,
     high: FloatArray,
-    accuracy: float = 2e-16,
+    tolerance: float = EXACT,
 ) -> FloatArray:
     """Return a root in each of many cells, all at once.
 
-    The Illinois method: a secant between two values of different sign, where an end that stays
-    counts half (Dowell and Jarratt 1971, BIT 11, 168).
+    The method of Chandrupatla (1997, Advances in Engineering Software 28, 145): a parabola through
+    three points in the direction of the values, or half of the cell where that may miss.
 
     :param function: from one number in each cell to its values, shape (n,) both.
-    :param low: lower ends of the cells, shape (n,).
-    :param high: upper ends, at which the function has the other sign, shape (n,).
-    :param accuracy: of the roots, relative where they are above 1.
+    :param low: ends of the cells, shape (n,).
+    :param high: their other ends, at which the function has the other sign, shape (n,).
+    :param tolerance: of a root near zero; of others it is that of the numbers.
     """
-    if not low.size:
-        return low
-    at_low, at_high = function(low), function(high)
-    place, moved = low, np.full(low.shape, 2)
+    here, far, at_here, at_far = low, high, function(low), function(high)
+    share = np.full(low.shape, 0.5)
     for _ in range(_MOST_STEPS):
-        before = place
-        with np.errstate(divide="ignore", invalid="ignore"):
-            place = (low * at_high - high * at_low) / (at_high - at_low)
-        # Rounding may place the root at an end, or a little beyond.
-        place = np.clip(np.where(np.isfinite(place), place, low), low, high)
-        if bool(np.all(np.abs(place - before) <= accuracy * np.maximum(np.abs(place), 1.0))):
-            break
+        place = here + share * (far - here)
         value = function(place)
-        below = np.sign(value) == np.sign(at_low)
-        again = np.where(below == moved, 0.5, 1.0)
-        at_low, at_high = (
-            np.where(below, value, again * at_low),
-            np.where(below, again * at_high, value),
-        )
-        moved = below
-        low, high = np.where(below, place, low), np.where(below, high, place)
-    return place
+        same = np.sign(value) == np.sign(at_here)
+        last, at_last = np.where(same, here, far), np.where(same, at_here, at_far)
+        far, at_far = np.where(same, far, here), np.where(same, at_far, at_here)
+        here, at_here = place, value
+        nearer = np.abs(at_here) < np.abs(at_far)
+        best, least = np.where(nearer, here, far), np.where(nearer, at_here, at_far)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            step = (EXACT * np.abs(best) + tolerance) / np.abs(far - here)
+            if bool(np.all((step > 0.5) | (least == 0.0) | (far == here))):
+                break
+            xi, phi = (here - far) / (last - far), (at_here - at_far) / (at_last - at_far)
+            ratio = (last - here) / (far - here)
+            share = at_here / (at_far - at_here) * at_last / (at_far - at_last)
+            share += ratio * at_here / (at_last - at_here) * at_far / (at_last - at_far)
+        inside = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
+        share = np.clip(np.where(inside, share, 0.5), step, 1.0 - step)
+    return best

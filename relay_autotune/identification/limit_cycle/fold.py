@@ -24,7 +24,6 @@ from numpy.polynomial.polynomial import polyder, polyval
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor
 from scipy.linalg.lapack import dpotrs
-from scipy.sparse import csr_array
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
@@ -54,6 +53,9 @@ class Spline:
     def __init__(
         self, basis: Basis, count: int, x: FloatArray, y: FloatArray, weight: FloatArray
     ) -> None:
+        # Imported here, because it loads slowly, and a record without a relay needs none.
+        from scipy.sparse import csr_array
+
         self._basis, self._count, self._x = basis, count, x
         self._root = np.sqrt(weight)[:, None]
         columns = basis.spline(x, count, 0)

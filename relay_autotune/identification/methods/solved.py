@@ -17,7 +17,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
@@ -104,6 +103,9 @@ class Fit:
 
         :param starts: at least one, shape (p,) each.
         """
+        # Imported here, because it loads slowly, and few records need it.
+        from scipy.optimize import least_squares
+
         low, high, scale = self._range
         points = sorted((self.searched(s) for s in starts), key=self._cost)
         found = self._cost(points[0]), points[0]
