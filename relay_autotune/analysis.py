@@ -149,6 +149,8 @@ def analyse(
     simple = next((m.model for m in models if m.structure == FOPDT.name), None)
     if alone:
         simple = chosen.simple(task)
+    # Its fit holds many times the memory of the record.
+    models[0] = replace(chosen.model, plain=None)
     rules = (rule,) if alone else _first(rule)
     tell("judging the model")
     record, cycles = chosen.record, chosen.cycles
@@ -230,7 +232,7 @@ class _Chosen:
     @property
     def alone(self) -> Analysis:
         """The analysis with this model only."""
-        return Analysis(self.record, self.cycles, (self.model,), 0)
+        return Analysis(self.record, self.cycles, (replace(self.model, plain=None),), 0)
 
     def simple(self, task: Task) -> TransferFunction | None:
         """Return the FOPDT for the rule, None if the rule needs none or there is none."""
@@ -238,7 +240,8 @@ class _Chosen:
             return self.model.model
         if task.rule == DEFAULT_RULE:
             return None
-        return _simple((self.record,), task.known, self.model)
+        fopdt = _fopdt((self.record,), task.known, self.model)
+        return None if fopdt is None else fopdt.model
 
 
 def _chosen(record: Record, task: Task) -> _Chosen | Analysis:
@@ -246,7 +249,7 @@ def _chosen(record: Record, task: Task) -> _Chosen | Analysis:
     record = thinned(record)
 
     def fit(part: Record) -> Identification:
-        return _guarded(part, task.method, task.known)
+        return _guarded(task.method, partial(identify, part, task.method, task.known))
 
     return _identified((record,), lambda: without_disturbance(record, fit))
 
@@ -320,8 +323,9 @@ def analyse_jointly(
     told = unequal_amplitudes(records, chosen.model)
     if told:
         chosen = replace(chosen, warnings=(*chosen.warnings, told))
-    found = Analysis(first, joint.cycles, assess((chosen,), first), 0)
-    simple = _simple(records, known, chosen)
+    fopdt = _fopdt(records, known, chosen)
+    found = Analysis(first, joint.cycles, assess((replace(chosen, plain=None),), first), 0)
+    simple = None if fopdt is None else fopdt.model
     return _judged(found, records, task, _first(rule), simple, rng)
 
 
@@ -383,21 +387,17 @@ def _first(rule: str) -> tuple[str, ...]:
     return (rule, *(name for name in RULES if name != rule))
 
 
-def _as_fopdt(known: Known) -> Known:
-    return replace(used_by(DEFAULT_METHOD, known), structure=FOPDT.name)
-
-
-def _simple(
+def _fopdt(
     records: Sequence[Record], known: Known, chosen: Identification
-) -> TransferFunction | None:
+) -> Identification | None:
     """Return the best FOPDT, which most rules need; None if there is none."""
-    if chosen.structure == FOPDT.name:
-        return chosen.model
-    try:
-        found = identify_jointly(records, DEFAULT_METHOD, _as_fopdt(known))
-    except RelayAutotuneError:
-        return None
-    return found.model
+    if chosen.method == DEFAULT_METHOD and chosen.structure == FOPDT.name:
+        return chosen
+    known = replace(used_by(DEFAULT_METHOD, known), structure=FOPDT.name)
+    beside = chosen.plain or partial(identify_jointly, records, DEFAULT_METHOD, known)
+    with suppress(RelayAutotuneError):
+        return _guarded(DEFAULT_METHOD, beside)
+    return None
 
 
 def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
@@ -415,9 +415,9 @@ def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
     return replace(found, gains=tuple(gains), recommended=0, added_delay=delay)
 
 
-def _guarded(record: Record, method: str, known: Known) -> Identification:
+def _guarded(method: str, fit: Callable[[], Identification]) -> Identification:
     try:
-        return identify(record, method, known)
+        return fit()
     except RelayAutotuneError:
         raise
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
@@ -433,15 +433,14 @@ def _others(record: Record, task: Task, chosen: Identification) -> list[Identifi
 
     The first is the best FOPDT, which most rules need.
     """
-    others = [m for m in METHODS if m not in (task.method, DEFAULT_METHOD)]
-    wanted = [(DEFAULT_METHOD, _as_fopdt(task.known))]
-    wanted += [(m, used_by(m, task.known)) for m in others]
-    if chosen.method == DEFAULT_METHOD and chosen.structure == FOPDT.name:
-        wanted = wanted[1:]
-    found = []
-    for name, known in wanted:
-        with suppress(RelayAutotuneError):
-            found.append(_guarded(record, name, known))
+    fopdt = _fopdt((record,), task.known, chosen)
+    found = [] if fopdt in (None, chosen) else [fopdt]
+    for name in METHODS:
+        if name not in (task.method, DEFAULT_METHOD):
+            with suppress(RelayAutotuneError):
+                found.append(
+                    _guarded(name, partial(identify, record, name, used_by(name, task.known)))
+                )
     return found
 
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -227,6 +228,8 @@ class Identification:
     to_explain: float = math.nan
     # Models that each half of the record allows by itself.
     halves: tuple[Part, ...] = ()
+    # Returns the FOPDT that was fitted beside the model; None: there is none, or it is the model.
+    plain: Callable[[], Identification] | None = None
 
     def __repr__(self) -> str:
         """Return the model on one line; the fields have the rest."""

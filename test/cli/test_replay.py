@@ -25,6 +25,7 @@ from made_bags import (
     write_pair,
     write_samples,
 )
+from pages import PROGRESS
 from report_cases import only
 
 from relay_autotune.analysis import analyse
@@ -60,14 +61,10 @@ def write_bag(path, folder, *records):
 FOPDT = ("--structure", "fopdt")
 
 
-# What is said of work that takes ten seconds, or will: where the machine is slow.
-_PROGRESS = re.compile(r"^(computing the model|reading .*), \d.*\n", re.MULTILINE)
-
-
 def run(capsys, *arguments) -> tuple[int, str, str]:
     status = replay.main([str(a) for a in arguments])
     out, err = capsys.readouterr()
-    return status, out, _PROGRESS.sub("", err)
+    return status, out, PROGRESS.sub("", err)
 
 
 def documents(text):
@@ -542,7 +539,7 @@ def test_two_processes_print_the_same_bytes(tmp_path, capsys):
     bag = write_bag(tmp_path / "bag", tmp_path, relay_record())
     asked = ("--json", *FOPDT, bag)
     other = process(*asked)
-    said = _PROGRESS.sub("", other.stderr)
+    said = PROGRESS.sub("", other.stderr)
     assert (other.returncode, other.stdout, said) == run(capsys, *asked)
 
 
@@ -578,7 +575,7 @@ def test_a_reader_that_leaves_early_gets_no_traceback(tmp_path):
     done = subprocess.run(
         ["bash", "-c", command], cwd=REPOSITORY, capture_output=True, text=True, timeout=120
     )
-    assert _PROGRESS.sub("", done.stderr) == ""
+    assert PROGRESS.sub("", done.stderr) == ""
 
 
 def test_numbers_that_json_lacks_are_null():

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from pages import PAGES, ROOT, Block, block_noted, blocks, commands, matches, sessions
+from pages import PAGES, PROGRESS, ROOT, Block, block_noted, blocks, commands, matches, sessions
 
 from relay_autotune import start
 from relay_autotune.cli import demo
@@ -31,7 +31,7 @@ def run(words: list[str], capfd: pytest.CaptureFixture[str]) -> tuple[str, int]:
     except SystemExit as end:
         status = int(end.code or 0)
     said = capfd.readouterr()
-    return said.err + said.out, status
+    return PROGRESS.sub("", said.err) + said.out, status
 
 
 @pytest.mark.parametrize("block", blocks("console"), ids=str)

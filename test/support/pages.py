@@ -22,6 +22,9 @@ _FENCE = re.compile(
     r"^(?P<indent> *)```(?P<language>\w+)\n(?P<text>.*?)^(?P=indent)```$",
     re.DOTALL | re.MULTILINE,
 )
+# What is said of work that takes ten seconds, or will: where the machine is slow.
+PROGRESS = re.compile(r"^(computing the model|reading .*), \d.*\n", re.MULTILINE)
+
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _TOKEN = re.compile(rf"\.\.\.|{_NUMBER.pattern}|[^\W\d]+|.", re.DOTALL)
 

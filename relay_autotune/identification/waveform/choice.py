@@ -147,7 +147,11 @@ def chosen_fit(
     if not fits:
         raise no_response(known)
     # Before a jump or without spikes the best simulation may: it shows these.
-    return next((f for f in fits if outweighs_disturbance(f.problem, f.state)), fits[-1])
+    best = next((f for f in fits if outweighs_disturbance(f.problem, f.state)), fits[-1])
+    plain = next((c for c in own if c.structure == FOPDT), None)
+    if plain is None or best.problem.structure == FOPDT:
+        return best
+    return replace(best, plain=_finished(plain, [], problem, scale))
 
 
 def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candidate]:

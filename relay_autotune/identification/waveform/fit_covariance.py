@@ -41,6 +41,7 @@ class Fit:
         themselves.
     :param loss: the loss that was minimised.
     :param warnings: sentences on what was left out.
+    :param plain: the fit of the FOPDT beside the same terms; None: there is none.
     """
 
     problem: Problem
@@ -50,6 +51,7 @@ class Fit:
     base: FloatArray | None = None
     loss: str = "squares"
     warnings: tuple[str, ...] = ()
+    plain: Fit | None = None
 
 
 def raw_residual(problem: Problem, state: Trial) -> FloatArray:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,7 +137,12 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
             "take memory and add nothing"
         )
         fit = replace(fit, warnings=(*fit.warnings, told))
-    return report(records, replace(fit, warnings=(*alike, *fit.warnings)))
+    fit = replace(fit, warnings=(*alike, *fit.warnings))
+    found = report(records, fit)
+    if fit.plain is not None:
+        plain = replace(fit.plain, warnings=fit.warnings)
+        found = replace(found, plain=partial(report, records, plain))
+    return found
 
 
 def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held: bool) -> Fit:
@@ -291,7 +297,7 @@ def _reweighted(whole: Problem, fit: Fit, loss: str, base: FloatArray) -> Fit:
         change = np.abs(state.theta - earlier.theta) / unit_steps(problem.structure, state.theta)
         if float(change.max()) <= TRIAL:
             break
-    return replace(fit, problem=problem, state=state, base=own, loss=loss)
+    return replace(fit, problem=problem, state=state, base=own, loss=loss, plain=None)
 
 
 def _places(whole: Problem, part: Problem) -> NDArray[np.int64]:
