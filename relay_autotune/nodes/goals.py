@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import math
+import re
+import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -19,16 +21,19 @@ from relay_autotune.experiment.phases import State
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.reasons import Code, Reason
-from relay_autotune.text import TOLD_EVERY
+from relay_autotune.text import LOGGED_EVERY, TOLD_EVERY
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import TransferFunction
 from relay_autotune_msgs.srv import StartTune
 
+_NUMBER = re.compile(r"[\d.]+")
+
 
 class Narrator:
-    """Log a sentence at once when it is asked for, and each second as long as there is one.
+    """Tell a sentence at once when it is asked for, and each second as long as there is one.
 
-    The first sentence of a tune, and that of each new state, come at once by `now`.
+    The first sentence of a tune, and that of each new state, come at once by `now`. The log has
+    each that differs in more than its numbers, and else one every ``LOGGED_EVERY`` seconds.
 
     :param node: the node, whose log and timer are used.
     :param words: returns the present sentence; empty: there is nothing to tell any more.
@@ -39,15 +44,20 @@ class Narrator:
         self._node = node
         self._words = words
         self._tell = tell
+        self._logged, self._logged_at = "", -math.inf
         self._timer = node.create_timer(TOLD_EVERY, self.now, clock=STEADY, autostart=False)
 
     def now(self) -> None:
         """Tell the present sentence, and the next one a second later."""
         if not (words := self._words()):
             self._timer.cancel()
+            self._logged = ""
             return
         self._timer.reset()
-        self._node.get_logger().info(words)
+        kind, now = _NUMBER.sub("", words), time.monotonic()
+        if kind != self._logged or now - self._logged_at >= LOGGED_EVERY:
+            self._logged, self._logged_at = kind, now
+            self._node.get_logger().info(words)
         self._tell(words)
 
 
