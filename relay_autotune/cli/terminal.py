@@ -507,7 +507,7 @@ def asked(
 
 def _require_somebody(flag: str) -> None:
     if not sys.stdin.isatty():
-        raise LoopError(f"nobody can be asked here: give {flag}")
+        raise LoopError(f"answers come from a terminal alone, and here is none: give {flag}")
 
 
 def _forget_typed() -> None:

@@ -276,9 +276,13 @@ class Session:
                     print(f"\nNext:\n  {'start it':<26} {prefix()}{shlex.join((PROGRAM, *again))}")
                 return True
             try:
-                return agrees("Start the tune?", yes=options.yes, back=may_go_back)
+                agreed = agrees("Start the tune?", yes=options.yes, back=may_go_back)
             except GoBack:
                 loop.ask_again()
+                continue
+            if not agreed:
+                say(PROGRAM, "not started")
+            return agreed
 
     def _may_start(self, loop: Loop, found: Any) -> bool:
         """Show whether a tune could start, and how.

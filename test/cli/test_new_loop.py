@@ -515,6 +515,19 @@ def test_an_answer_that_was_mistyped_is_changed_at_the_next_question(
     assert not agrees("Start the tune?", yes=False)
 
 
+def test_a_tune_that_nobody_agrees_to_is_said_not_to_start(
+    typed: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    typed += ["maybe"]
+    given = SimpleNamespace(yes=False, dry_run=False)
+    loop: Any = SimpleNamespace(
+        plan=list, check=lambda deadline: None, answers=SimpleNamespace(may_go_back=False)
+    )
+    session: Any = SimpleNamespace(options=given, _may_start=lambda loop, found: True)
+    assert not tune_loop.Session._is_agreed(session, loop, math.inf)
+    assert capsys.readouterr().err.endswith("tune_loop: not started\n")
+
+
 def test_units_that_are_typed_or_that_messages_say_stand_everywhere(
     typed: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -667,7 +680,7 @@ def test_where_nobody_can_be_asked_the_flags_are_named(monkeypatch: pytest.Monke
         TopicLoop(Looker(), options("--at", "2"))
     with pytest.raises(LoopError, match=r"give --command-within$"):
         TopicLoop(Looker(), options("--at", "2", "--within", "1", "9"))
-    with pytest.raises(LoopError, match="give --yes"):
+    with pytest.raises(LoopError, match=r"answers come from a terminal alone, .*: give --yes"):
         agrees("Start?", yes=False)
     assert agrees("Start?", yes=True)
 
