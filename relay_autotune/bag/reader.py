@@ -164,11 +164,9 @@ def _data_files(path: Path) -> list[Path]:
     # A recorder that was killed while it compressed leaves both.
     files = [e for e in entries if e.name in plain or (_named_so(e) and e.stem not in plain)]
     if not files:
-        found = ", ".join(entry.name for entry in entries[:5]) or "nothing"
-        raise BagError(
-            f"the directory {path} holds no .mcap or .db3 file, but {found}; expected a rosbag2 "
-            "directory"
-        )
+        found = ", ".join(entry.name for entry in entries[:5])
+        held = f"holds no .mcap or .db3 file, but {found}" if found else "is empty"
+        raise BagError(f"the directory {path} {held}; expected a rosbag2 directory")
     return files
 
 

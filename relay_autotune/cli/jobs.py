@@ -149,12 +149,10 @@ def replay(job: Job, working: Working | None = None) -> Done:
         why = f"{job.name} could not be analysed: {defect(error)}"
         return _failed(job, said, why, NOTHING_FOUND)
     status = status_of(analyses)
-    if status == NOTHING_FOUND:
-        # A table has the reason for a model without gains.
+    if status == NOTHING_FOUND and not job.table_width:
+        # A table has the reasons.
         said += [
-            f"{job.name}: {'' if a.models else 'nothing identified: '}{a.reason}"
-            for a in analyses
-            if not (a.models and job.table_width)
+            f"{job.name}: {'' if a.models else 'nothing identified: '}{a.reason}" for a in analyses
         ]
     above, text = "", _text(job, analyses)
     if job.name_width and analyses:

@@ -37,6 +37,7 @@ from relay_autotune.cli.report import (
     as_asked,
     check_output,
     command_line,
+    tell_replaced,
     write_report,
 )
 from relay_autotune.cli.terminal import Working, require_new, width, write
@@ -145,7 +146,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
         if wanted and (options.output or options.scheduler or options.jobs > 1):
             raise SelectionError(f"{flag} cannot be combined with --output, --jobs or --scheduler")
     if options.report:
-        check_output(PROGRAM, options.report)
+        check_output(options.report)
     if options.web:
         check_web(options)
     if options.output:
@@ -174,6 +175,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
             cases += [case_of(analysis, done.name) for analysis in done.analyses]
             cases += [unreadable(done.name, done.error)] * bool(done.error and options.report)
     if analyses and options.report:
+        tell_replaced(PROGRAM, options.report)
         write_report(as_asked(cases, options), options.report)
         say(PROGRAM, f"the report is {options.report}")
     elif analyses and status != DONE and len(jobs) == 1 and is_table:

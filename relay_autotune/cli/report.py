@@ -93,7 +93,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace) -> int:
-    check_output(PROGRAM, options.output)
+    check_output(options.output)
     # Imported here, since it takes long.
     from relay_autotune.report.case import unreadable
 
@@ -120,6 +120,7 @@ def _run(options: argparse.Namespace) -> int:
     if failed == len(sources):
         return status
     cases = as_asked(cases, options)
+    tell_replaced(PROGRAM, options.output)
     write_report(cases, options.output, title=options.title)
     print(options.output)
     if options.figures:
@@ -159,12 +160,9 @@ def as_asked(cases: Sequence[Case], options: argparse.Namespace) -> list[Case]:
     return [replace(case, present=present, command=options.command_line) for case in cases]
 
 
-def check_output(program: str, output: str) -> None:
+def check_output(output: str) -> None:
     """Refuse a report that could not be written, before any work is done.
 
-    An earlier report of the same name is replaced, and a line says so.
-
-    :param program: name of the command.
     :param output: name of its file.
     :raises SelectionError: if the ending is unknown, the folder does not exist, the file cannot be
         written, or it is a page of somebody else.
@@ -197,8 +195,16 @@ def check_output(program: str, output: str) -> None:
         ) from error
     if not existed:
         path.unlink()
-        return
-    say(program, f"{path} exists and will be replaced")
+
+
+def tell_replaced(program: str, output: str) -> None:
+    """Say that an earlier report of the same name is replaced.
+
+    :param program: name of the command.
+    :param output: name of its file.
+    """
+    if os.path.lexists(output):
+        say(program, f"{output} exists and will be replaced")
 
 
 def write_report(cases: Sequence[Case], output: str, *, title: str = "") -> None:

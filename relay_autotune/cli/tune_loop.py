@@ -203,9 +203,10 @@ class Session:
         """Refuse what could not be written or served, before any work is done."""
         options = self.options
         if options.report:
-            from relay_autotune.cli.report import check_output
+            from relay_autotune.cli.report import check_output, tell_replaced
 
-            check_output(PROGRAM, options.report)
+            check_output(options.report)
+            tell_replaced(PROGRAM, options.report)
         if options.export:
             require_new(options.export)
         if options.web:

@@ -376,7 +376,10 @@ def test_a_recording_that_is_not_there(tmp_path):
 
 
 def test_directories_without_a_bag(tmp_path):
-    with pytest.raises(BagError, match=r"holds no \.mcap or \.db3 file, but nothing"):
+    with pytest.raises(BagError, match=r" is empty; expected a rosbag2 directory"):
+        read_experiments(tmp_path)
+    (tmp_path / "notes.txt").write_bytes(b"")
+    with pytest.raises(BagError, match=r"holds no \.mcap or \.db3 file, but notes\.txt; "):
         read_experiments(tmp_path)
     (tmp_path / "old_0.db3").write_bytes(b"")
     with pytest.raises(BagError, match=r"old_0\.db3 is empty"):

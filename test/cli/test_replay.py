@@ -456,10 +456,10 @@ def test_bad_recordings_end_with_one_line_and_status_1(tmp_path, capsys, name):
     assert status == 1
     assert err.startswith("replay: ")
     assert str(path) in err
-    _, *more = err.splitlines()
-    # What has an experiment can be looked at.
-    figures = f"replay: figures show why: report {path} -o report.html"
-    assert more == [figures] * (name == "short.csv")
+    # What has an experiment is told in the table, and can be looked at.
+    figures = f"replay: figures show why: report {path} -o report.html\n"
+    assert (err == figures) is (name == "short.csv")
+    assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -519,6 +519,9 @@ def test_a_constant_measurement_in_an_experiment_is_said(tmp_path, capsys):
     assert status == 1
     assert "nothing identified" in err
     assert documents(out)[0]["experiments"][0]["models"] == []
+    status, out, err = run(capsys, tmp_path / "bag")
+    assert (status, " ".join(out.split()).count("no response to the kick")) == (1, 1)
+    assert "no response to the kick" not in err
 
 
 _REPLAY = "from relay_autotune.start import replay; raise SystemExit(replay())"

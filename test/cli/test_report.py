@@ -191,6 +191,8 @@ def test_an_earlier_report_is_replaced_with_a_word_and_the_page_of_another_never
     _, _, err = run(capsys, result, "-o", page, "--title", "Again")
     assert f"{page} exists and will be replaced" in err
     assert page.read_bytes() != first
+    status, _, err = run(capsys, tmp_path / "none.csv", "-o", page)
+    assert (status, err.count("\n"), "does not exist" in err) == (1, 1, True)
     status, _, err = run(capsys, result, "-o", other)
     assert (status, "name another file" in err) == (2, True)
     assert "My tank" in other.read_text()
