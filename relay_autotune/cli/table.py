@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relay_autotune.cli.terminal import (
+    LABEL_WIDTH,
     NARROWEST,
     UNITS,
     WIDEST,
@@ -293,7 +294,7 @@ def _limit_cycle(analysis: Analysis) -> list[_Entry]:
 
 def _identification(found: Identification) -> list[_Entry]:
     name = f"{found.structure}, {found.method}"
-    lines = _process("process", found.model, name)
+    numbers = []
     structure = found.estimate.structure
     intervals = zip(found.values, found.ci95_low, found.ci95_high, strict=True)
     for parameter, (value, low, high) in zip(structure.parameters, intervals, strict=True):
@@ -301,13 +302,14 @@ def _identification(found: Identification) -> list[_Entry]:
         end = digits(high) if np.isfinite(high) else "any"
         interval = f"95 %: {digits(low)} to {end}" if np.isfinite(low) else ""
         doubt = "   not determined" if label in found.undetermined else ""
-        lines.append(_row(label.replace("_", " "), value, unit, interval + doubt))
+        numbers.append((label.replace("_", " "), digits(value), unit, interval + doubt))
     for label, value, std, unit in (
         ("ultimate gain", found.ultimate_gain, found.ultimate_gain_std, "u/y"),
         ("ultimate freq.", found.ultimate_frequency, found.ultimate_frequency_std, "rad/s"),
     ):
         if math.isfinite(value):
-            lines.append(_row(label, value, unit, plus_minus(value, NORMAL_95 * std)))
+            numbers.append((label, digits(value), unit, plus_minus(value, NORMAL_95 * std)))
+    lines = [*_process("process", found.model, name), *_below_one_another(numbers)]
     lines += _known_all_the_same(found)
     lines.append(("fit", _fit(found)))
     if found.validation is not None:
@@ -450,8 +452,16 @@ def _step(does: Performance) -> str:
     )
 
 
-def _row(label: str, value: float, unit: str, interval: str) -> _Entry:
-    return f"  {label}", f"{digits(value):>9} {in_units(unit, UNITS):<6} {interval}".rstrip()
+def _below_one_another(numbers: Sequence[tuple[str, str, str, str]]) -> list[_Entry]:
+    """Return numbers, each with label, unit and interval, in columns; a label may be long."""
+    rows = [(f"  {label}", n, in_units(unit, UNITS), more) for label, n, unit, more in numbers]
+    over = [max(len(label) - LABEL_WIDTH, 0) for label, *_ in rows]
+    wide = max([9, *(o + len(number) for o, (_, number, _, _) in zip(over, rows, strict=True))])
+    units = max([6, *(len(unit) for _, _, unit, _ in rows)])
+    return [
+        (label, f"{number:>{wide - o}} {unit:<{units}} {more}".rstrip())
+        for o, (label, number, unit, more) in zip(over, rows, strict=True)
+    ]
 
 
 def _process(label: str, model: TransferFunction, note: str) -> list[_Entry]:

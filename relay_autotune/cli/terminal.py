@@ -33,7 +33,7 @@ WIDEST = 99
 NARROWEST = 40
 
 _INDENT = "  "
-_LABEL = 16
+LABEL_WIDTH = 16
 # Quantities on one line stand this far apart.
 _GAP = "   "
 
@@ -119,7 +119,7 @@ class Help(argparse.RawDescriptionHelpFormatter):
 
 
 def labelled(
-    label: str, text: str, columns: int, *, indent: int = len(_INDENT) + _LABEL + 1
+    label: str, text: str, columns: int, *, indent: int = len(_INDENT) + LABEL_WIDTH + 1
 ) -> list[str]:
     """Return text beside its label, as lines.
 

@@ -11,12 +11,16 @@ import sys
 import time
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from analysed import completed
 
 from relay_autotune.cli import arguments, terminal, tune
-from relay_autotune.cli.table import table
-from relay_autotune.cli.terminal import Working, labelled
+from relay_autotune.cli.table import identification_lines, table
+from relay_autotune.cli.terminal import Working, labelled, with_units
+from relay_autotune.identification.estimate import Estimate
+from relay_autotune.identification.result import identified
+from relay_autotune.process.structures import LAG_COMPLEX
 
 COMMANDS = ("replay", "report", "tune", "identify", "csv_to_bag", "tune_loop", "apply_gains")
 
@@ -40,6 +44,16 @@ def check_widths(printed):
 def test_the_result_of_a_recording_fits_the_terminal_and_no_word_is_broken():
     found = replace(completed(), reason="the file /home/somebody/of-a-tank.csv says so " * 3)
     check_widths({columns: table("bag", [found], columns) for columns in (80, 99)})
+
+
+def test_numbers_stand_below_one_another_beside_long_labels_and_units():
+    numbers = {"gain": -0.0003191, "natural_frequency": 0.01234, "damping": 0.5}
+    values = np.array([numbers.get(name, 5.0) for name in LAG_COMPLEX.names])
+    found = identified("waveform", Estimate.of(LAG_COMPLEX, values, np.diag(0.01 * values**2)))
+    with with_units({"y": "degree Celsius", "u": "%"}):
+        lines = identification_lines(found, 99)
+    assert len({line.index("95 %") for line in lines if "95 %" in line}) == 1
+    assert {line[27:28] for line in lines if "95 %" in line or "±" in line} <= set("0123456789")
 
 
 def test_the_rules_side_by_side_fit_the_terminal(monkeypatch, capsys):
