@@ -45,7 +45,7 @@ RESULTS = (
     *(Identification, FitReport, Validation, FrequencyPoint, Combination, Rival),
     *(Gains, Performance, Finding, RelaySettings, LimitCycle, Cycle, FitProgress),
 )
-# As long as the record, and what is told by other fields of the document.
+# As long as the record, what is told by other fields of the document, and another model.
 UNTOLD = {
     *(
         (Identification, name)
@@ -58,6 +58,7 @@ UNTOLD = {
             "loaded",
             "to_explain",
             "halves",
+            "plain",
         )
     ),
     (LimitCycle, "period_std"),
