@@ -145,13 +145,11 @@ def analyse(
         return chosen
     if not alone:
         tell("comparing methods")
-    models = [chosen.model, *([] if alone else _others(chosen.record, task, chosen.model))]
+    models = [chosen.model, *([] if alone else _others(chosen, task))]
+    rules = (rule,) if alone else _first(rule)
     simple = next((m.model for m in models if m.structure == FOPDT.name), None)
     if alone:
-        simple = chosen.simple(task)
-    # Its fit holds many times the memory of the record.
-    models[0] = replace(chosen.model, plain=None)
-    rules = (rule,) if alone else _first(rule)
+        simple = chosen.simple(known, rules)
     tell("judging the model")
     record, cycles = chosen.record, chosen.cycles
     found = Analysis(record, cycles, assess(models, record), 0)
@@ -175,7 +173,8 @@ def model_so_far(record: Record, task: Task | None = None, *, predicts: bool = F
     if not predicts:
         return chosen.alone
     of = chosen.model, chosen.record, chosen.cycles
-    designed = task_of_record(*of, task.options, chosen.simple(task))
+    simple = chosen.simple(task.known, (task.rule,))
+    designed = task_of_record(*of, task.options, simple)
     predicted = predicted_ms(designed, rule_named(task.rule))
     return replace(chosen.alone, predicted=predicted)
 
@@ -220,27 +219,52 @@ class RunningFit:
 class _Chosen:
     """The selected model.
 
-    :param record: the record.
+    :param records: what was identified; the first represents all.
     :param cycles: its whole cycles.
-    :param model: the identification.
+    :param model: the identification, without the fit of the FOPDT, which holds many times the
+        memory of the record.
+    :param plain: of the identification.
     """
 
-    record: Record
+    records: Sequence[Record]
     cycles: tuple[Cycle, ...]
     model: Identification
+    plain: Callable[[], Identification | None] | None
+
+    @property
+    def record(self) -> Record:
+        """The record."""
+        return self.records[0]
 
     @property
     def alone(self) -> Analysis:
         """The analysis with this model only."""
-        return Analysis(self.record, self.cycles, (replace(self.model, plain=None),), 0)
+        return Analysis(self.record, self.cycles, (self.model,), 0)
 
-    def simple(self, task: Task) -> TransferFunction | None:
-        """Return the FOPDT for the rule, None if the rule needs none or there is none."""
+    def fopdt(self, known: Known) -> Identification | None:
+        """Return the best FOPDT by the default method; None: there is none.
+
+        :param known: known values of the process.
+        """
+        known = replace(used_by(DEFAULT_METHOD, known), structure=FOPDT.name)
+
+        def fit() -> Identification:
+            beside = None if self.plain is None else self.plain()
+            return beside or identify_jointly(self.records, DEFAULT_METHOD, known)
+
+        with suppress(RelayAutotuneError):
+            return _guarded(DEFAULT_METHOD, fit)
+        return None
+
+    def simple(self, known: Known, rules: Sequence[str]) -> TransferFunction | None:
+        """Return the FOPDT that most rules need; None: these do not, or there is none.
+
+        :param known: known values of the process.
+        :param rules: names of the rules.
+        """
         if self.model.structure == FOPDT.name:
             return self.model.model
-        if task.rule == DEFAULT_RULE:
-            return None
-        fopdt = _fopdt((self.record,), task.known, self.model)
+        fopdt = None if tuple(rules) == (DEFAULT_RULE,) else self.fopdt(known)
         return None if fopdt is None else fopdt.model
 
 
@@ -272,7 +296,8 @@ def _identified(
         reason = _with_outcome(first, str(error))
         return Analysis(first, cycles, reason=reason, judgement=Judgement(refused=reason))
     said = [record.unthinned.remark for record in records if record.unthinned is not None]
-    return _Chosen(first, cycles, replace(found, warnings=(*found.warnings, *said)))
+    model = replace(found, plain=None, warnings=(*found.warnings, *said))
+    return _Chosen(records, cycles, model, found.plain)
 
 
 def _chosen_so_far(record: Record, task: Task) -> _Chosen | Analysis:
@@ -323,10 +348,9 @@ def analyse_jointly(
     told = unequal_amplitudes(records, chosen.model)
     if told:
         chosen = replace(chosen, warnings=(*chosen.warnings, told))
-    fopdt = _fopdt(records, known, chosen)
-    found = Analysis(first, joint.cycles, assess((replace(chosen, plain=None),), first), 0)
-    simple = None if fopdt is None else fopdt.model
-    return _judged(found, records, task, _first(rule), simple, rng)
+    found = Analysis(first, joint.cycles, assess((chosen,), first), 0)
+    rules = _first(rule)
+    return _judged(found, records, task, rules, joint.simple(known, rules), rng)
 
 
 def _judged(
@@ -387,19 +411,6 @@ def _first(rule: str) -> tuple[str, ...]:
     return (rule, *(name for name in RULES if name != rule))
 
 
-def _fopdt(
-    records: Sequence[Record], known: Known, chosen: Identification
-) -> Identification | None:
-    """Return the best FOPDT, which most rules need; None if there is none."""
-    if chosen.method == DEFAULT_METHOD and chosen.structure == FOPDT.name:
-        return chosen
-    known = replace(used_by(DEFAULT_METHOD, known), structure=FOPDT.name)
-    beside = chosen.plain or partial(identify_jointly, records, DEFAULT_METHOD, known)
-    with suppress(RelayAutotuneError):
-        return _guarded(DEFAULT_METHOD, beside)
-    return None
-
-
 def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
     """Add the gains of the rules that apply to the selected model; the first rule must apply."""
     try:
@@ -428,13 +439,15 @@ def _guarded(method: str, fit: Callable[[], Identification]) -> Identification:
         ) from error
 
 
-def _others(record: Record, task: Task, chosen: Identification) -> list[Identification]:
+def _others(chosen: _Chosen, task: Task) -> list[Identification]:
     """Return the models of the other methods that apply, for comparison.
 
     The first is the best FOPDT, which most rules need.
     """
-    fopdt = _fopdt((record,), task.known, chosen)
-    found = [] if fopdt in (None, chosen) else [fopdt]
+    record, model = chosen.record, chosen.model
+    is_fopdt = model.method == DEFAULT_METHOD and model.structure == FOPDT.name
+    fopdt = None if is_fopdt else chosen.fopdt(task.known)
+    found = [] if fopdt is None else [fopdt]
     for name in METHODS:
         if name not in (task.method, DEFAULT_METHOD):
             with suppress(RelayAutotuneError):

@@ -229,7 +229,7 @@ class Identification:
     # Models that each half of the record allows by itself.
     halves: tuple[Part, ...] = ()
     # Returns the FOPDT that was fitted beside the model; None: there is none, or it is the model.
-    plain: Callable[[], Identification] | None = None
+    plain: Callable[[], Identification | None] | None = None
 
     def __repr__(self) -> str:
         """Return the model on one line; the fields have the rest."""

@@ -136,6 +136,12 @@ def test_tests_that_were_aborted_give_no_gains():
     assert found.reason == "the experiment was aborted: no gains. a hand did it"
 
 
+def test_rules_for_fopdt_take_that_of_the_method():
+    known = Known(structure="fopdt")
+    found = analyse_jointly((unbiased(), unbiased(8.0)), method="li", rule="simc", known=known)
+    assert found.shaping.task.simple == found.model.model
+
+
 def test_unknown_names_are_refused():
     with pytest.raises(RelayAutotuneError, match="unknown rule"):
         analyse_jointly([unbiased()], method="li", rule="none")

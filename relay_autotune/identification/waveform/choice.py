@@ -15,6 +15,7 @@ import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from operator import itemgetter
 
 import numpy as np
@@ -151,7 +152,7 @@ def chosen_fit(
     plain = next((c for c in own if c.structure == FOPDT), None)
     if plain is None or best.problem.structure == FOPDT:
         return best
-    return replace(best, plain=_finished(plain, [], problem, scale))
+    return replace(best, plain=partial(_finished, plain, [], problem, scale))
 
 
 def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candidate]:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +41,7 @@ class Fit:
         themselves.
     :param loss: the loss that was minimised.
     :param warnings: sentences on what was left out.
-    :param plain: the fit of the FOPDT beside the same terms; None: there is none.
+    :param plain: fits the FOPDT beside the same terms to the end; None: there is none.
     """
 
     problem: Problem
@@ -51,7 +51,7 @@ class Fit:
     base: FloatArray | None = None
     loss: str = "squares"
     warnings: tuple[str, ...] = ()
-    plain: Fit | None = None
+    plain: Callable[[], Fit | None] | None = None
 
 
 def raw_residual(problem: Problem, state: Trial) -> FloatArray:

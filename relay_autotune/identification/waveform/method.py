@@ -139,10 +139,14 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
         fit = replace(fit, warnings=(*fit.warnings, told))
     fit = replace(fit, warnings=(*alike, *fit.warnings))
     found = report(records, fit)
-    if fit.plain is not None:
-        plain = replace(fit.plain, warnings=fit.warnings)
-        found = replace(found, plain=partial(report, records, plain))
-    return found
+    return found if fit.plain is None else replace(found, plain=partial(_beside, records, fit))
+
+
+def _beside(records: Sequence[Record], fit: Fit) -> Identification | None:
+    """Return the FOPDT that was fitted beside a model; None if it cannot be fitted to the end."""
+    assert fit.plain is not None
+    plain = fit.plain()
+    return None if plain is None else report(records, replace(plain, warnings=fit.warnings))
 
 
 def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held: bool) -> Fit:
