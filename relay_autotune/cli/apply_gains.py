@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, finite, guarded_in_graph, say
@@ -197,7 +197,7 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
     if not agreed:
         say(PROGRAM, "nothing was changed")
         return False, ""
-    accepting = client.accepting_doubtful() if options.accept_doubtful else nullcontext()
+    accepting = client.allowing(accept_doubtful=options.accept_doubtful)
     if options.no_verify:
         with accepting:
             client.ask("apply")

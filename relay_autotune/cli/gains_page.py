@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -199,7 +199,8 @@ class GainsPage:
             self._try(wish, message)
             return
         live.tell(phase="applying", tone="", status="putting the gains in force")
-        with self._accepting(wish) as controller:
+        controller = self._found()
+        with controller.allowing(accept_doubtful=wish.doubtful):
             told = controller.put_in_force(message)
         live.rest(f"{told}; they are not verified", good=True, proof=())
 
@@ -221,8 +222,9 @@ class GainsPage:
                 subject = self.page.subjects[wish.of]
                 subject.case = replace(subject.case, proof=entries)
         else:
+            controller = self._found()
             with (
-                self._accepting(wish) as controller,
+                controller.allowing(accept_doubtful=wish.doubtful),
                 controller.offered(message) if message else nullcontext() as new,
             ):
                 self._begin_step("")
@@ -237,13 +239,6 @@ class GainsPage:
             # The proof before stays where this one was cut short.
             proof=entries if result.steps else live.told.proof,
         )
-
-    @contextmanager
-    def _accepting(self, wish: PageCommand) -> Iterator[GainsClient]:
-        """Return the client of the controller_node, which takes what the wish accepts."""
-        controller = self._found()
-        with controller.accepting_doubtful() if wish.doubtful else nullcontext():
-            yield controller
 
     def _say(self, text: str) -> None:
         self.live.tell(status=text)

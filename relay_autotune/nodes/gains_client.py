@@ -192,16 +192,25 @@ class GainsClient(LoopClient):
             return self.ask("apply", lambda: "the gains are in force" * self.has(gains))
 
     @contextmanager
-    def accepting_doubtful(self) -> Iterator[None]:
-        """Let the node take doubtful gains and models until the end of the block."""
-        before = self.values(self.name, ["accept_doubtful"])
-        self.set_values(self.name, {"accept_doubtful": True})
+    def allowing(self, **least: float | bool) -> Iterator[None]:
+        """Let the node do until the end of the block what the user has agreed to.
+
+        :param least: what its parameters have to be at least, by name.
+        """
+        before = self.values(self.name, list(least))
+        raised = {name: value for name, value in least.items() if value > before[name]}
+        if raised:
+            self.set_values(self.name, raised)
         try:
             yield
+        except GoneError:
+            # Nobody is left who has them.
+            raised.clear()
+            raise
         finally:
-            # A node that has gone has lost the parameter, too.
-            with suppress(LoopError):
-                self.set_values(self.name, before)
+            if raised:
+                with suppress(LoopError):
+                    self.set_values(self.name, {name: before[name] for name in raised})
 
     def steps(self, gains: Controller | None) -> StepsHere:
         """Return the steps of the set-point that may prove gains here.
@@ -257,24 +266,14 @@ class GainsClient(LoopClient):
         :return: the `Verify.Result`.
         :raises LoopError: with the reason, if there is no verdict.
         """
-        before = self.values(self.name, ("verify_step", "verify_step_max"))
-        more = abs(setpoint) > max(map(abs, before.values()))
         target, places = self._there()
         there = self.values(target, list(places.values()))
         goal = Verify.Goal(setpoint_step=setpoint, load_step=load, patience=patience)
-        if more:
-            self.set_values(self.name, {"verify_step_max": abs(setpoint)})
-        try:
-            result = self._verified(goal, new, tell, leave)
-        except GoneError as error:
-            # Nobody is left who has it.
-            more = False
-            raise GoneError(f"{error}; {self._taken_back(target, there)}") from error
-        finally:
-            if more:
-                with suppress(LoopError):
-                    self.set_values(self.name, {"verify_step_max": before["verify_step_max"]})
-        return result
+        with self.allowing(verify_step_max=abs(setpoint)):
+            try:
+                return self._verified(goal, new, tell, leave)
+            except GoneError as error:
+                raise GoneError(f"{error}; {self._taken_back(target, there)}") from error
 
     def _there(self) -> tuple[str, dict[str, str]]:
         """Return the node that has the gains, and its parameter for each."""

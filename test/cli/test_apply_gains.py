@@ -30,7 +30,8 @@ from relay_autotune.exchange.messages import fill_gains, fill_reason
 from relay_autotune.loop.analysis import performance_beside
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import Limits
-from relay_autotune.nodes.gains_client import StepsHere
+from relay_autotune.nodes.gains_client import GainsClient, StepsHere
+from relay_autotune.nodes.loop_client import GoneError
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code
 from relay_autotune.record.record import Record, RelaySettings
@@ -279,6 +280,7 @@ def client_of(prove: Any, in_force: Any) -> Any:
         in_force=in_force, identified=lambda: (MODEL, 0.01),
         waiting=lambda: (GAINS, ""), has=lambda gains: in_force() is gains,
         steps=lambda gains: StepsHere(None, 0.0), name="controller_node", prove=prove,
+        allowing=lambda **least: nullcontext(),
     )  # fmt: skip
 
 
@@ -297,6 +299,25 @@ def test_ctrl_c_in_a_proof_ends_it_and_the_last_line_says_what_is_in_force(
     with pytest.raises(KeyboardInterrupt):
         apply_gains.apply_and_verify(client_of(prove, lambda: None), given)
     assert capsys.readouterr().err.endswith("cancelled; kc 0.1 in force again\n")
+
+
+def test_what_a_node_allows_is_raised_until_the_end_of_a_block_unless_the_node_has_gone() -> None:
+    before = {"accept_doubtful": False, "verify_step_max": 0.5}
+    there = dict(before)
+    client: Any = GainsClient.__new__(GainsClient)
+    client.name = "/controller_node"
+    client.values = lambda node, names: {name: there[name] for name in names}
+    client.set_values = lambda node, values: there.update(values)
+    with client.allowing(accept_doubtful=True, verify_step_max=0.2):
+        assert there == {"accept_doubtful": True, "verify_step_max": 0.5}
+    assert there == before
+    with pytest.raises(LoopError, match="cancelled"), client.allowing(verify_step_max=2.0):
+        assert there == before | {"verify_step_max": 2.0}
+        raise LoopError("cancelled")
+    assert there == before
+    with pytest.raises(GoneError), client.allowing(verify_step_max=2.0):
+        client.set_values = None
+        raise GoneError("it is gone")
 
 
 def test_new_gains_that_could_not_be_taken_back_are_told_as_such(
@@ -328,6 +349,7 @@ def test_the_page_refuses_a_step_beyond_the_limits_before_anything_changes() -> 
         in_force=lambda: Controller(0.1, 3.0), steps=lambda gains: StepsWithin(2.0),
         offered=changed.append, prove=lambda *words: changed.append(words),
         name="/controller_node", find=lambda patience: None, steps_of=lambda result: [],
+        allowing=lambda **least: nullcontext(),
     )  # fmt: skip
     loop: Any = SimpleNamespace(
         proves=False, client=SimpleNamespace(controllers=lambda: ["/controller_node"])
