@@ -193,9 +193,9 @@ class Session:
         signals.note(signal.SIGINT, *(ending_signals() - {signal.SIGTSTP}))
         signals.raise_if_came()
         if options.web:
-            from relay_autotune.cli.tune_page import TunePage
+            from relay_autotune.cli.tune_page import serve
 
-            return TunePage(loops, options).run(signals.came)
+            return serve(loops, options, signals.came)
         self._tune(loop, deadline)
         return self._concluded(loop)
 

@@ -65,39 +65,30 @@ _TICK = 0.05
 _TONES = {"completed": "good", "aborted": "bad", "failed": "bad"}
 
 
-class TunePage:
-    """The page of one or more loops.
+def serve(loops: Sequence[Loop], options: argparse.Namespace, interrupted: list[int]) -> int:
+    """Serve the page of one or more loops, and do what is wished there, until a signal comes.
 
     :param loops: that it shows.
     :param options: as the command line gives them.
+    :param interrupted: signals that have come.
+    :return: the worst exit status that the last tune of a loop deserves.
+    :raises LoopError: if a relay_node is lost during a tune; the other loops go on until the end.
     """
-
-    def __init__(self, loops: Sequence[Loop], options: argparse.Namespace) -> None:
-        lives = [Live(loop.title) for loop in loops]
-        self._page = Page((), address_of(options.web_address), lives)
-        self._page.units = UNITS
-        self._loops = [_LoopOnPage(loop, self._page, n) for n, loop in enumerate(loops)]
-
-    def run(self, interrupted: list[int]) -> int:
-        """Serve the page, and do what is wished there, until a signal comes.
-
-        :param interrupted: signals that have come.
-        :return: the worst exit status that the last tune of a loop deserves.
-        :raises LoopError: if a relay_node is lost during a tune; the other loops go on until the
-            end.
-        """
-        with in_background(self._page) as url:
-            say(
-                PROGRAM,
-                f"the page is at {url} until Ctrl-C; nothing is commanded before a tune is "
-                "started there",
-            )
-            with ThreadPoolExecutor(len(self._loops)) as pool:
-                running = [pool.submit(loop.run, interrupted) for loop in self._loops]
-                # Only the main thread hears signals, and only between its own steps.
-                while not all(each.done() for each in running):
-                    time.sleep(_TICK)
-            return worst(*(each.result() for each in running))
+    page = Page((), address_of(options.web_address), [Live(loop.title) for loop in loops])
+    page.units = UNITS
+    shown = [_LoopOnPage(loop, page, n, interrupted) for n, loop in enumerate(loops)]
+    with in_background(page) as url:
+        say(
+            PROGRAM,
+            f"the page is at {url} until Ctrl-C; nothing is commanded before a tune is started "
+            "there",
+        )
+        with ThreadPoolExecutor(len(shown)) as pool:
+            running = [pool.submit(each.run) for each in shown]
+            # Only the main thread hears signals, and only between its own steps.
+            while not all(each.done() for each in running):
+                time.sleep(_TICK)
+        return worst(*(each.result() for each in running))
 
 
 class _LoopOnPage:
@@ -106,9 +97,10 @@ class _LoopOnPage:
     :param loop: the loop.
     :param page: that shows it.
     :param number: of the loop on the page.
+    :param interrupted: signals that have come.
     """
 
-    def __init__(self, loop: Loop, page: Page, number: int) -> None:
+    def __init__(self, loop: Loop, page: Page, number: int, interrupted: list[int]) -> None:
         self._loop, self._client, self._options = loop, loop.client, loop.options
         self._page, self._number = page, number
         self._live = page.lives[number]
@@ -116,7 +108,7 @@ class _LoopOnPage:
         self._terminal = Shown(sys.stderr, live=len(page.lives) == 1 and sys.stderr.isatty())
         # The context in which commands are shown as they come.
         self._commands_shown: Callable[[], AbstractContextManager[None]] = nullcontext
-        self._interrupted: list[int] = []
+        self._interrupted = interrupted
         self._gains = GainsPage(loop, self._live, page, number, self._is_to_end)
         # About the running tune: messages of the cycles, K_u after each, signals or a wish to end
         # it, and what is done at its first feedback.
@@ -125,19 +117,17 @@ class _LoopOnPage:
         self._ends: list[int] = []
         self._at_first: Callable[[], object] | None = None
 
-    def run(self, interrupted: list[int]) -> int:
+    def run(self) -> int:
         """Do what is wished on the page, until a signal comes.
 
-        :param interrupted: signals that have come.
         :return: the exit status that the last tune deserves.
         :raises LoopError: if relay_node is lost during a tune.
         """
         status = DONE
-        self._interrupted = interrupted
         self._live.tell(status="nothing is commanded before a tune is started here")
         try:
             self._show_signals()
-            while not interrupted:
+            while not self._interrupted:
                 self._client.rest(_TICK)
                 wish = self._live.next_wish()
                 if wish is None:
