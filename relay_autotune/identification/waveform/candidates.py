@@ -222,7 +222,7 @@ class FitContext:
         u = self.problem.inputs[0]
         if not isinstance(u, PiecewiseConstant):
             return math.inf
-        return _LEAST_FRICTION * float(np.ptp(u.values))
+        return _LEAST_FRICTION * float(np.ptp(np.append(u.values, u.initial)))
 
     @cached_property
     def pushed(self) -> float:
