@@ -116,6 +116,7 @@ def chosen_fit(
     *,
     held: bool,
     among: Sequence[str] = TRIED,
+    before: Fit | None = None,
 ) -> Fit:
     """Return the fit of the best structure, in the colour of its noise.
 
@@ -125,10 +126,11 @@ def chosen_fit(
     :param scale: range of the measurement [y].
     :param held: True: a relay held the process, so that it may be unstable.
     :param among: names of the structures, where none is known.
+    :param before: what was chosen for nearly the same samples, from which the search goes on, too.
     :raises IdentificationError: if no structure explains the record.
     """
     few = _dense_enough(problem, sign, held)
-    found = _compared(few, known, among)
+    found = _compared(few, known, among, before)
     dense = problem.thinned(_MOST_WHITE)
     if found and dense.time.size > few.problem.time.size:
         found = _on_more_samples(replace(few, problem=dense), found)
@@ -259,7 +261,9 @@ def _dense_enough(problem: Problem, sign: int, held: bool) -> FitContext:
     return FitContext.of(more, sign, held=held)
 
 
-def _compared(context: FitContext, known: Known, among: Sequence[str] = TRIED) -> list[Candidate]:
+def _compared(
+    context: FitContext, known: Known, among: Sequence[str], before: Fit | None
+) -> list[Candidate]:
     """Return all structures in one colour, with the terms beside them, the best first.
 
     The terms are decided with a few simple structures.
@@ -270,6 +274,11 @@ def _compared(context: FitContext, known: Known, among: Sequence[str] = TRIED) -
     if known.structure:
         names = first = [known.structure]
     simple = context.fit(first, known.order)
+    if before is not None:
+        problem = as_in(before.problem, context.problem)
+        state = refine(problem, before.state.theta, tolerance=TRIAL, most=STEPS)
+        again = context.candidate(problem, state)
+        simple += [] if again is None else [again]
     if not simple:
         return []
     decided = _with_best_terms(context, simple)

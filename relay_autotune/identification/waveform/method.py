@@ -152,8 +152,8 @@ def _beside(records: Sequence[Record], fit: Fit) -> Identification | None:
 def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held: bool) -> Fit:
     """Fit, again with each experiment weighted by its noise, and again without spikes."""
 
-    def chosen(samples: Problem, among: Sequence[str] = TRIED) -> Fit:
-        return chosen_fit(samples, known, sign, scale, held=held, among=among)
+    def chosen(samples: Problem, among: Sequence[str] = TRIED, before: Fit | None = None) -> Fit:
+        return chosen_fit(samples, known, sign, scale, held=held, among=among, before=before)
 
     stopped = ""
     if not sign and len(problem.bounds) == 1:
@@ -281,7 +281,7 @@ def _spared_of_outliers(problem: Problem, fit: Fit, known: Known, chosen: Choose
     # They would pull both the choice and the fit.
     rest = replace(problem, weight=base) if len(problem.bounds) > 1 else problem
     # They hide differences, so that what was hopeless with them is without them.
-    again = chosen(rest.part(~outlying), names_near(fit))
+    again = chosen(rest.part(~outlying), names_near(fit), fit)
     told = (
         f"{int(np.sum(outlying))} of the samples lie more than {_OUTLIER:g} standard deviations "
         "off every model and were left out: check the sensor for spikes"
