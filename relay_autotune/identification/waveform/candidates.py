@@ -77,10 +77,10 @@ IMITATES_A_DRIFT = 10.0
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
 # zero of a slower inverse response as a drift.
 _LASTING = 2.0
-# Longest dead time in lengths of the record: a later response cannot be told from a drift.
-_LATE = 0.25
-# Longest of all: what came later than half of the record has nothing to confirm it.
-_LATEST = 0.5
+# Share of the longest dead time beyond which a response cannot be told from a drift.
+_LATE = 0.5
+# A fit that was not brought to its end stops within a hundredth of its bound.
+_EARLY = 0.99
 # Least dry friction or play, as a share of the command's range: the steps of a sensor look like
 # a tenth.
 _LEAST_FRICTION = 0.01
@@ -280,7 +280,7 @@ class FitContext:
         if not self.held:
             # A relay bounds an integrator and what grows by itself, and shows both.
             lasting = any(abs(t) > _LASTING * self.length for t in model.time_constants)
-            late = model.dead_time > _LATE * self.length
+            late = model.dead_time > _LATE * problem.latest
             imitations += lasting or late or self.is_turned(state) or not model.is_stable
             # The free rate of an integrator is what a free state is to a lag: one imitation.
             imitations -= problem.drift and model.integrators > 0
@@ -429,8 +429,8 @@ class FitContext:
 
         :param candidate: any; further terms may make an earlier one of it.
         """
-        late = candidate.model.dead_time > _LATEST * self.length
-        return self.sign * candidate.model.process_sign >= 0 and (self.held or not late)
+        early = candidate.model.dead_time < _EARLY * candidate.problem.latest
+        return self.sign * candidate.model.process_sign >= 0 and early
 
     def refit(self, candidate: Candidate, colour: Colour | None) -> Candidate | None:
         """Fit a candidate in another colour, from where it is.

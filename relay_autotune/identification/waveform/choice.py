@@ -62,6 +62,7 @@ from relay_autotune.process.structures import (
     UNSTABLE_FOPDT,
     UNSTABLE_SOPDT,
 )
+from relay_autotune.record.excitation import changes_within
 
 # Order in which structures are fitted: first those that show which others are hopeless.
 TRIED = tuple(
@@ -106,6 +107,9 @@ _INDIFFERENT = 2.0
 # random walk explains the response itself. Of 50 records with every kind of noise and a process
 # that is not linear, the right model left up to 3.6 times as much (benchmarks/unmodelled.py).
 _WORSE = 6.0
+# Longest dead time as a share of the time after the first change of the command: what came later
+# has nothing to confirm it, and may be of the past.
+_LATEST = 0.5
 
 
 def chosen_fit(
@@ -129,6 +133,8 @@ def chosen_fit(
     :param before: what was chosen for nearly the same samples, from which the search goes on, too.
     :raises IdentificationError: if no structure explains the record.
     """
+    if not held:
+        problem = replace(problem, latest=_LATEST * _answering(problem))
     few = _dense_enough(problem, sign, held)
     found = _compared(few, known, among, before)
     dense = problem.thinned(_MOST_WHITE)
@@ -155,6 +161,16 @@ def chosen_fit(
     if plain is None or best.problem.structure == FOPDT:
         return best
     return replace(best, plain=partial(_finished, plain, [], problem, scale))
+
+
+def _answering(problem: Problem) -> float:
+    """Return the longest time in which an experiment shows what its commands do [s]."""
+    lasting = []
+    for part, u in zip(problem.experiments, problem.inputs, strict=True):
+        time = problem.time[part]
+        changes = changes_within(u, time)
+        lasting.append(float(time[-1] - (changes[0] if changes.size else time[0])))
+    return max(lasting)
 
 
 def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candidate]:

@@ -55,6 +55,7 @@ class Problem:
     :param motions: the direction in which the measurement moves, 1 or -1, and the command from
         its first level while it stands still; empty: not seen.
     :param colour: of the noise; None: white.
+    :param latest: longest dead time of a fit [s].
     """
 
     time: FloatArray
@@ -73,6 +74,7 @@ class Problem:
     friction: bool = False
     motions: tuple[PiecewiseConstant, ...] = ()
     colour: Colour | None = None
+    latest: float = math.inf
 
     @property
     def past_is_open(self) -> bool:

@@ -158,7 +158,7 @@ def refine(
     if isinstance(start, Trial):
         state, damping = start, start.damping
     else:
-        state = evaluate(problem, start)
+        state = evaluate(problem, np.append(start[:-1], min(start[-1], problem.latest)))
     growth = _GROWTH
     longest = _LONGEST * float(np.ptp(problem.time))
     # A rough answer must not take as many trials as an exact one.
@@ -167,15 +167,18 @@ def refine(
     scale, normal, gradient = _linearised(problem, state)
     for _ in range(min(most, _MOST_ROUGH_ITERATIONS) if rough else most):
         step = _solve(normal, gradient, damping)
-        least = -float(state.theta[-1] / scale[-1])
-        if step[-1] < least:
-            # The dead time stops at zero, and the other steps are solved with it fixed there.
-            rest = gradient[:-1] - normal[:-1, -1] * least
-            step = np.append(_solve(normal[:-1, :-1], rest, damping), least)
+        low, high = (np.array((0.0, problem.latest)) - state.theta[-1]) / scale[-1]
+        last = min(max(step[-1], low), high)
+        if step[-1] != last:
+            # The dead time stops at a bound, and the other steps are solved with it fixed there.
+            rest = gradient[:-1] - normal[:-1, -1] * last
+            step = np.append(_solve(normal[:-1, :-1], rest, damping), last)
         predicted = float(step @ (2.0 * gradient - normal @ step))
         if rough and predicted <= tolerance * state.cost and damping <= _LITTLE_DAMPING:
             break
-        moved = stepped(problem.structure, state.theta, step, longest, problem.shortest)
+        moved = stepped(
+            problem.structure, state.theta, step, longest, problem.shortest, problem.latest
+        )
         trial = evaluate(problem, moved)
         smallest = float(np.abs(step).max()) < _SMALLEST_STEP
         idle = 0 if state.cost - trial.cost > tolerance * state.cost else idle + 1

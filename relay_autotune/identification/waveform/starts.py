@@ -319,7 +319,7 @@ def _costs(
         along += np.einsum("dn,dn->d", response, left)
         total += np.einsum("dn,dn->d", left, left)
     power[power == 0.0] = 1.0
-    refused = dead_times > np.where(along < 0.0, *latest)
+    refused = dead_times > np.minimum(np.where(along < 0.0, *latest), problem.latest)
     return np.asarray(total - np.where(refused, 0.0, along**2 / power))
 
 
