@@ -205,17 +205,6 @@ class FitContext:
         nearly = left**2 <= _NEARLY_ALL * total**2
         return nearly and self.fopdt.coefficients[0] * state.coefficients[0] < 0.0
 
-    def simulates_worse(self, problem: Problem, state: Trial) -> bool:
-        """Return whether a fit simulates the record no better than the FOPDT does.
-
-        :param problem: of this context, with any structure and colour.
-        :param state: the fit.
-        """
-        return (
-            left_in_simulation(problem, state.coefficients, state.theta)[0]
-            >= self._left_by_fopdt[0]
-        )
-
     @cached_property
     def least_friction(self) -> float:
         """Least dry friction or play that counts [u]; infinite for ramps, which show neither."""
@@ -250,9 +239,6 @@ class FitContext:
             if not any(-_LASTING * self.length < z.real < 0.0 for z in model.zeros):
                 return None
         elif model.dead_time > self.latest[model.process_sign > 0]:
-            return None
-        if not self.held and self.is_turned(state) and self.simulates_worse(problem, state):
-            # A colour explains the response, too: there a plain model shows the direction.
             return None
         if min(problem.effects(state.coefficients)) < 0.0:
             # Commands may lose their effect on one side, but not act the other way there.

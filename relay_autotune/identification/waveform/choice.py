@@ -146,9 +146,14 @@ def chosen_fit(
         turned = (few.refit(c, found[0].problem.colour) for c in few.turned())
         found = [*found, *(c for c in turned if c is not None)]
     # Where a disturbance that no term describes made a colour that explains the response, too,
-    # the simulation shows it.
-    white = (few.refit(c, None) for c in own if c.problem.colour is not None)
-    simulated = sorted((c for c in white if c is not None), key=lambda c: c.score)
+    # the simulation shows it, and the direction.
+    white = [c if c.problem.colour is None else few.refit(c, None) for c in own]
+    simulated = [w for c, w in zip(own, white, strict=True) if w is not None and w is not c]
+    own = [
+        c
+        for c, w in zip(own, white, strict=True)
+        if w is None or w.model.process_sign == c.model.process_sign
+    ]
     fits: list[Fit] = []
     for group in (own, simulated):
         finished = (_finished(c, found, problem, scale) for c in _by_rank(group))
