@@ -203,11 +203,8 @@ class GainsClient(LoopClient):
             self.set_values(self.name, raised)
         try:
             yield
-        except GoneError:
-            # Nobody is left who has them.
-            raised.clear()
-            raise
         finally:
+            # One that hangs may come back.
             if raised:
                 with suppress(LoopError):
                     self.set_values(self.name, {name: before[name] for name in raised})
