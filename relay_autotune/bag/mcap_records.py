@@ -409,7 +409,8 @@ def sorted_records(
     known[list(declared)] = True
     found: dict[int, Messages] = {}
     for number, own in _by_channel(channels, wanted):
-        at, of_it = places[own], heads[own]
+        at = places[own]
+        of_it = _heads(content, at)
         end = at + RECORD.size + of_it["length"].astype(np.int64)
         found[number] = _messages_at(content, at, of_it, end)
     return Sorted(found, others, places[~known[channels]], short)
