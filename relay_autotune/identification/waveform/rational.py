@@ -56,7 +56,6 @@ def stepped(
     step: FloatArray,
     longest: float = math.inf,
     least: float = 0.0,
-    latest: float = math.inf,
 ) -> FloatArray:
     """Return theta after a step in units of :func:`unit_steps`, within its bounds.
 
@@ -65,7 +64,6 @@ def stepped(
     :param step: shape (m,).
     :param longest: time constant beyond which a lag is an integrator [s].
     :param least: as for :func:`unit_steps`.
-    :param latest: longest dead time [s].
     """
     # For so few numbers plain floats are quicker than arrays.
     *logs, dead_time = theta.tolist()
@@ -82,7 +80,7 @@ def stepped(
         first += len(factor.parameters)
     limited = _clip(by_dead_time, -_DEAD_TIME_STEP, _DEAD_TIME_STEP)
     later = dead_time + limited * float(unit_steps(structure, theta, least)[-1])
-    return np.array([*logs, _clip(later, 0.0, latest)])
+    return np.array([*logs, max(later, 0.0)])
 
 
 def _clip(value: float, low: float, high: float) -> float:

@@ -176,9 +176,7 @@ def refine(
         predicted = float(step @ (2.0 * gradient - normal @ step))
         if rough and predicted <= tolerance * state.cost and damping <= _LITTLE_DAMPING:
             break
-        moved = stepped(
-            problem.structure, state.theta, step, longest, problem.shortest, problem.latest
-        )
+        moved = stepped(problem.structure, state.theta, step, longest, problem.shortest)
         trial = evaluate(problem, moved)
         smallest = float(np.abs(step).max()) < _SMALLEST_STEP
         idle = 0 if state.cost - trial.cost > tolerance * state.cost else idle + 1
