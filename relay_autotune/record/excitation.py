@@ -135,6 +135,16 @@ def changes_within(u: Input, time: FloatArray) -> FloatArray:
     return np.asarray(u.times[(u.times >= time[0]) & (u.times < time[-1])])
 
 
+def answering_time(time: FloatArray, u: Input) -> float:
+    """Return how long samples go on after the first change of an input within them [s].
+
+    :param time: of the samples [s], shape (n,).
+    :param u: the input; where it does not change, the time of all samples counts.
+    """
+    changes = changes_within(u, time)
+    return float(time[-1] - (changes[0] if changes.size else time[0]))
+
+
 def begins_at_rest(time: FloatArray, y: FloatArray, u: Input) -> bool:
     """Return whether an experiment begins with a rest, which shows what came before.
 

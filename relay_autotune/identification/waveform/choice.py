@@ -62,7 +62,7 @@ from relay_autotune.process.structures import (
     UNSTABLE_FOPDT,
     UNSTABLE_SOPDT,
 )
-from relay_autotune.record.excitation import changes_within
+from relay_autotune.record.excitation import answering_time
 
 # Order in which structures are fitted: first those that show which others are hopeless.
 TRIED = tuple(
@@ -134,7 +134,9 @@ def chosen_fit(
     :raises IdentificationError: if no structure explains the record.
     """
     if not held:
-        problem = replace(problem, latest=_LATEST * _answering(problem))
+        parts = zip(problem.experiments, problem.inputs, strict=True)
+        longest = max(answering_time(problem.time[part], u) for part, u in parts)
+        problem = replace(problem, latest=_LATEST * longest)
     few = _dense_enough(problem, sign, held)
     found = _compared(few, known, among, before)
     dense = problem.thinned(_MOST_WHITE)
@@ -166,16 +168,6 @@ def chosen_fit(
     if plain is None or best.problem.structure == FOPDT:
         return best
     return replace(best, plain=partial(_finished, plain, [], problem, scale))
-
-
-def _answering(problem: Problem) -> float:
-    """Return the longest time in which an experiment shows what its commands do [s]."""
-    lasting = []
-    for part, u in zip(problem.experiments, problem.inputs, strict=True):
-        time = problem.time[part]
-        changes = changes_within(u, time)
-        lasting.append(float(time[-1] - (changes[0] if changes.size else time[0])))
-    return max(lasting)
 
 
 def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candidate]:

@@ -30,7 +30,7 @@ from relay_autotune.process.response import response
 from relay_autotune.process.structures import Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.record.excitation import changes_within
+from relay_autotune.record.excitation import answering_time, changes_within
 from relay_autotune.record.record import Input, PiecewiseConstant
 
 # Least number of samples in each period of an oscillation of the process.
@@ -168,7 +168,7 @@ def time_scales(problem: Problem) -> tuple[float, float]:
         gaps = np.diff(time)
         shortest = float(np.median(gaps[gaps > 0.0]))
         inside = changes_within(u, time)
-        rest = float(time[-1] - (inside[0] if inside.size else time[0]))
+        rest = answering_time(time, u)
         if inside.size > _MOST_SWITCHES * time.size and isinstance(u, PiecewiseConstant):
             # A controller moves a little at each sample, and far when its set-point is switched.
             steps = np.abs(np.diff(u.values, prepend=u.initial))
