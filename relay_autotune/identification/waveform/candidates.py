@@ -26,7 +26,6 @@ from relay_autotune.identification.waveform.separable import (
     Trial,
     evaluate,
     information_criterion,
-    left_in_simulation,
     left_of,
     refine,
 )
@@ -77,15 +76,11 @@ IMITATES_A_DRIFT = 10.0
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
 # zero of a slower inverse response as a drift.
 _LASTING = 2.0
-# Share of the longest dead time beyond which a response cannot be told from a drift.
-_LATE = 0.5
 # A fit that was not brought to its end stops within a hundredth of its bound.
 _EARLY = 0.99
 # Least dry friction or play, as a share of the command's range: the steps of a sensor look like
 # a tenth.
 _LEAST_FRICTION = 0.01
-# Largest share that a FOPDT leaves unexplained which shows the direction of the process.
-_NEARLY_ALL = 0.1
 
 
 @dataclass(frozen=True)
@@ -189,23 +184,6 @@ class FitContext:
         return latest_dead_times(self.problem, self.sign)
 
     @cached_property
-    def _left_by_fopdt(self) -> tuple[float, float]:
-        """Rms that the FOPDT leaves in simulation, and that of what it is to explain."""
-        return left_in_simulation(self.problem, self.fopdt.coefficients, self.fopdt.theta)
-
-    def is_turned(self, state: Trial) -> bool:
-        """Return whether a fit has not the direction of a FOPDT that explains nearly all.
-
-        A zero, and an integrator beside a drift, follow a slow disturbance with a gain of either
-        sign.
-
-        :param state: the fit.
-        """
-        left, total = self._left_by_fopdt
-        nearly = left**2 <= _NEARLY_ALL * total**2
-        return nearly and self.fopdt.coefficients[0] * state.coefficients[0] < 0.0
-
-    @cached_property
     def least_friction(self) -> float:
         """Least dry friction or play that counts [u]; infinite for ramps, which show neither."""
         u = self.problem.inputs[0]
@@ -266,8 +244,7 @@ class FitContext:
         if not self.held:
             # A relay bounds an integrator and what grows by itself, and shows both.
             lasting = any(abs(t) > _LASTING * self.length for t in model.time_constants)
-            late = model.dead_time > _LATE * problem.latest
-            imitations += lasting or late or self.is_turned(state) or not model.is_stable
+            imitations += lasting or not model.is_stable
             # The free rate of an integrator is what a free state is to a lag: one imitation.
             imitations -= problem.drift and model.integrators > 0
         return score + IMITATES_A_DRIFT * imitations
