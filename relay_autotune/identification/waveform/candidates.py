@@ -68,7 +68,7 @@ TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "friction")
 _BEFORE = frozenset(("drift", "relaxation", "past"))
 # Steps of a fit with a further term or in another colour; instants at which a load is tried, and
 # steps to the best.
-STEPS, _INSTANTS, _STEPS_IN_TIME = 15, 60, 4
+_STEPS, _INSTANTS, _STEPS_IN_TIME = 15, 60, 4
 
 # Twice the logarithm of the prior odds against a term that can imitate a drift, for which a
 # record without one has no use: 150 to 1.
@@ -234,6 +234,14 @@ class FitContext:
             return None
         return Candidate(problem, state, model, self._score(problem, state, model))
 
+    def near(self, problem: Problem, state: Trial) -> Candidate | None:
+        """Fit a problem from the fit of a similar one; None as for :meth:`candidate`.
+
+        :param problem: what is fitted.
+        :param state: the fit of the similar one.
+        """
+        return self.candidate(problem, _refined(problem, state))
+
     def _score(self, problem: Problem, state: Trial, model: TransferFunction) -> float:
         n = problem.time.size
         # The instant of a load is estimated, too.
@@ -275,7 +283,7 @@ class FitContext:
         else:
             changed: dict[str, Any] = dict.fromkeys(terms, True)
             problem = replace(candidate.problem, **changed)
-            state = refine(problem, candidate.state.theta, tolerance=TRIAL, most=STEPS)
+            state = _refined(problem, candidate.state)
             if not _BEFORE.isdisjoint(terms):
                 state = self._out_of_a_wrong_minimum(problem, state)
         other = self.candidate(problem, state)
@@ -401,9 +409,7 @@ class FitContext:
         :param candidate: of this context's samples.
         :param colour: of the noise; None: white.
         """
-        problem = replace(candidate.problem, colour=colour)
-        state = refine(problem, candidate.state.theta, tolerance=TRIAL, most=STEPS)
-        return self.candidate(problem, state)
+        return self.near(replace(candidate.problem, colour=colour), candidate.state)
 
     def _family(self, name: str, order: int) -> Iterator[Structure]:
         """Yield the structures of a name that there are samples enough for."""
@@ -430,6 +436,11 @@ class FitContext:
             # A command off its balance leaves a drift, which is a term of its own.
             least = math.inf
         return multistart(problem, self._starts(self.guess, structure), least)
+
+
+def _refined(problem: Problem, state: Trial) -> Trial:
+    """Return the fit of a problem, from that of a similar one."""
+    return refine(problem, state.theta, tolerance=TRIAL, most=_STEPS)
 
 
 def nuisances_of(problem: Problem, terms: Iterable[str] = TERMS) -> tuple[bool, ...]:
@@ -468,11 +479,10 @@ def with_load(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
     answers = answers - (answers @ basis) @ basis.T
     remaining = [float(np.sum(left_of(left, rows) ** 2)) for rows in answers.swapaxes(0, 1)]
     load = float(instants[int(np.argmin(remaining))])
-    theta = state.theta
+    found = state
     for _ in range(_STEPS_IN_TIME):
         loaded = replace(problem, load=load)
-        found = refine(loaded, theta, tolerance=TRIAL, most=STEPS)
-        theta = found.theta
+        found = _refined(loaded, found)
         step, shifts = found.coefficients[loaded.places("load")]
         shift = -float(shifts / step) * problem.shortest if step else 0.0
         farthest = float(instants[1] - instants[0])

@@ -24,7 +24,6 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.candidates import (
-    STEPS,
     Candidate,
     FitContext,
     as_in,
@@ -41,7 +40,6 @@ from relay_autotune.identification.waveform.residuals import (
     slow_colour,
 )
 from relay_autotune.identification.waveform.separable import (
-    TRIAL,
     Trial,
     information_criterion,
     left_in_simulation,
@@ -180,11 +178,13 @@ def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candid
     for c in found:
         if c.score <= found[0].score + _HOPELESS:
             problem = drop_first_dead_time(as_in(c.problem, context.problem), c.state)
-            state = refine(problem, c.state.theta, tolerance=TRIAL, most=STEPS)
-            if c is found[0] and _colour(problem, state) is not None:
+            more = context.near(problem, c.state)
+            if more is None:
+                continue
+            if c is found[0] and _colour(more.problem, more.state) is not None:
                 return found
-            again.append(context.candidate(problem, state))
-    return sorted((c for c in again if c is not None), key=lambda c: c.score) or found
+            again.append(more)
+    return sorted(again, key=lambda c: c.score) or found
 
 
 def no_response(known: Known) -> IdentificationError:
@@ -288,9 +288,7 @@ def _compared(
         names = first = [known.structure]
     simple = context.fit(first, known.order)
     if before is not None:
-        problem = as_in(before.problem, context.problem)
-        state = refine(problem, before.state.theta, tolerance=TRIAL, most=STEPS)
-        again = context.candidate(problem, state)
+        again = context.near(as_in(before.problem, context.problem), before.state)
         simple += [] if again is None else [again]
     if not simple:
         return []
