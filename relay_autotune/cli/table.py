@@ -420,7 +420,7 @@ def _gains(gains: Gains, verdict: Verdict, series: Sequence[str]) -> list[_Entry
         ),
         (
             "  predicted",
-            f"Ms {digits(gains.ms, 3)} (95 %: {digits(gains.ms_95, 3)})   "
+            f"Ms {digits(gains.ms, 3)} (95 %: <= {digits(gains.ms_95, 3)})   "
             f"Mt {digits(gains.mt, 3)}   gain margin {digits(gains.gain_margin, 3)}   "
             f"phase margin {digits(math.degrees(gains.phase_margin), 3)} deg",
         ),
