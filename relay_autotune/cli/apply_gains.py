@@ -22,10 +22,9 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, finite, guarded_in_graph, say
+from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, Parser, finite, guarded_in_graph, say
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import (
-    Help,
     Working,
     agreed_step,
     agrees,
@@ -65,11 +64,10 @@ def main(args: Sequence[str] | None = None) -> int:
     return guarded_in_graph(PROGRAM, lambda graph: _work(options, graph))
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
+def _parser() -> Parser:
+    parser = Parser(
+        PROGRAM,
         description=__doc__,
-        formatter_class=Help,
         epilog="Example:\n  apply_gains --namespace tank --step 0.5",
     )
     parser.add_argument("--namespace", default="", metavar="NS", help="namespace of the loop")

@@ -17,9 +17,9 @@ import sys
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
-from relay_autotune.cli.terminal import broken, end_with_terminal, width
+from relay_autotune.cli.terminal import Help, broken, end_with_terminal, width
 from relay_autotune.errors import (
     MissingPackageError,
     ParameterError,
@@ -54,6 +54,42 @@ def exit_status(*, found: bool, doubtful: bool) -> int:
     return DOUBTFUL if doubtful else DONE
 
 
+_NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z|-inf|-nan")
+
+
+class Parser(argparse.ArgumentParser):
+    """The command line of a command. What is wrong with it is said in one line.
+
+    :param program: name of the command.
+    :param others: as for :class:`argparse.ArgumentParser`.
+    """
+
+    def __init__(self, program: str, **others: Any) -> None:
+        super().__init__(program, formatter_class=Help, **others)
+
+    def parse_known_args(self, args: Iterable[str] | None = None, namespace: Any = None) -> Any:
+        """Take a number below zero, such as -1e-3, for a number, not for an option."""
+        given = sys.argv[1:] if args is None else args
+        # An argument that begins with a blank is no option.
+        shown = [f" {each}" if _NEGATIVE.match(each) else each for each in given]
+        return super().parse_known_args(shown, namespace)
+
+    def error(self, message: str) -> NoReturn:
+        """End the process, and say where it stands what there is.
+
+        :param message: what is wrong.
+        """
+        self.refuse(f"{message}; {self.prog} --help shows what it takes")
+
+    def refuse(self, message: str) -> NoReturn:
+        """End the process with status 2.
+
+        :param message: what is wrong, and what to do.
+        """
+        say(self.prog, message)
+        sys.exit(USAGE)
+
+
 # Set to anything in the environment, it lets a defect end a command with its traceback.
 DEBUG = "RELAY_AUTOTUNE_DEBUG"
 
@@ -67,18 +103,6 @@ def finite(text: str) -> float:
     if not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"expected a finite number, found {text.strip()}")
     return value
-
-
-_NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z|-inf|-nan")
-
-
-def with_negative(arguments: Iterable[str]) -> list[str]:
-    """Return the command line so that argparse takes -1e-3 for a number, not for an option.
-
-    :param arguments: those of the command line.
-    """
-    # An argument that begins with a blank is no option.
-    return [f" {each}" if _NEGATIVE.match(each) else each for each in arguments]
 
 
 def say(program: str, text: str) -> None:

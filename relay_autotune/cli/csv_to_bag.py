@@ -12,7 +12,7 @@ from pathlib import Path
 
 from relay_autotune.bag.csv_file import read_csv
 from relay_autotune.bag.signals import Selection
-from relay_autotune.cli.arguments import DONE, finite, run_command, say
+from relay_autotune.cli.arguments import DONE, Parser, finite, run_command, say
 from relay_autotune.cli.jobs import add_times
 from relay_autotune.errors import BagError, SelectionError
 
@@ -36,11 +36,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: those of the command line; default: the process's own.
     :return: the exit status.
     """
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
+    parser = Parser(
+        PROGRAM,
         description="Make a rosbag2 bag of two columns of a CSV file.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("csv", metavar="CSV", type=Path, help="file with a header line")
     parser.add_argument("bag", metavar="BAG", type=Path, help="directory to make")

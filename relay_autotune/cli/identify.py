@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import inspect
 import math
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -17,11 +16,11 @@ import numpy as np
 
 from relay_autotune.cli.arguments import (
     DONE,
+    Parser,
     add_quantities,
     flag_of,
     given_quantities,
     run_command,
-    with_negative,
 )
 from relay_autotune.cli.table import identification_lines
 from relay_autotune.cli.terminal import labelled, width
@@ -49,6 +48,7 @@ PROGRAM = "identify"
 
 _EPILOG = """\
 Results go to standard output, everything else to standard error.
+
 Exit status: 0 done; 1 no model has these numbers; 2 the command line is wrong.
 
 Examples:
@@ -322,23 +322,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: those of the command line; default: the process's own.
     :return: the exit status.
     """
-    given = sys.argv[1:] if arguments is None else arguments
-    options = _parser().parse_args(with_negative(given))
+    options = _parser().parse_args(arguments)
     return run_command(PROGRAM, lambda: _run(options))
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> Parser:
     methods: list[str] = []
     for name, chart in CHART_METHODS.items():
         needed = chart.required
         numbers = [_FLAGS[n] if n in needed else f"[{_FLAGS[n]}]" for n in chart.takes]
         methods += labelled(name, chart.summary, width(), indent=17)
         methods += labelled("", "   ".join(numbers), width(), indent=17)
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
+    parser = Parser(
+        PROGRAM,
         description="Identify a process from the numbers of a limit cycle, without a record.",
         epilog="\n".join(["methods and their numbers:", *methods, "", _EPILOG]),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--method", required=True, metavar="NAME", help="how to identify")
     add_quantities(parser, NUMBERS)

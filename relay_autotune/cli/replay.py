@@ -16,6 +16,7 @@ from relay_autotune.bag.reader import READABLE, may_be_recording, recordings_in
 from relay_autotune.cli.arguments import (
     DONE,
     DOUBTFUL,
+    Parser,
     add_web,
     check_web,
     run_command,
@@ -60,6 +61,7 @@ Others among several BAGs are passed over, with a line each. Of a folder of
 recordings a table is printed as they are done, a line for each experiment.
 
 Results go to standard output, everything else to standard error.
+
 Exit status: 0 every bag gave gains; 1 at least one gave none; 2 the command
 line, or the choice of topics or columns, is wrong; 3 gains of at least one
 experiment are doubtful.
@@ -89,13 +91,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(PROGRAM, lambda: _run(parser, options))
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
+def _parser() -> Parser:
+    parser = Parser(
+        PROGRAM,
         usage="%(prog)s [options] BAG [BAG ...]",
         description="Identify the process in recordings, and tune a controller for it.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("bags", nargs="+", metavar="BAG", help="recordings")
     add_analysis(parser)

@@ -24,6 +24,7 @@ from relay_autotune.cli.arguments import (
     DONE,
     NOTHING_FOUND,
     USAGE,
+    Parser,
     flag_of,
     run_command,
     say,
@@ -70,12 +71,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(PROGRAM, lambda: _run(options))
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
+def _parser() -> Parser:
+    parser = Parser(
+        PROGRAM,
         description="Write a report: the gains, the model, figures, and how sure they are.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("sources", nargs="+", metavar="SOURCE", help="recordings or results")
     parser.add_argument(

@@ -16,9 +16,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from relay_autotune.cli.arguments import DONE, run_command
+from relay_autotune.cli.arguments import DONE, Parser, run_command
 from relay_autotune.cli.own_nodes import START_WITHIN, OwnNodes
-from relay_autotune.cli.terminal import Help, Working, number_of
+from relay_autotune.cli.terminal import Working, number_of
 from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError
 
 PROGRAM = "simulated_loop"
@@ -35,11 +35,10 @@ def main(args: Sequence[str] | None = None) -> int:
     return run_command(PROGRAM, lambda: _run(options))
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
+def _parser() -> Parser:
+    parser = Parser(
+        PROGRAM,
         description=__doc__,
-        formatter_class=Help,
         epilog="Then, in another terminal:\n  tune_loop",
     )
     parser.add_argument(

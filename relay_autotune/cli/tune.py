@@ -17,17 +17,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import (
     DONE,
     NOTHING_FOUND,
+    Parser,
     add_web,
     check_web,
     finite,
     run_command,
     say,
-    with_negative,
 )
 from relay_autotune.cli.jobs import (
     add_design,
@@ -420,12 +420,14 @@ def _judged(found: Gains | Performance) -> tuple[str, ...]:
 PROGRAM = "tune"
 
 _EPILOG = """\
-The model is given by flags or by a JSON document: one of `replay --json` or
-`identify --json`, or an object such as
-{"gain": 1.65, "time_constants": [20], "dead_time": 10}; - reads standard
-input.  Units: y of the measurement, u of the command, s.
+The model is given by flags or by a JSON document, of `replay --json` or
+`identify --json`, or such as
+  {"gain": 1.65, "time_constants": [20], "dead_time": 10}
+A document - is read from standard input.
+Units: y of the measurement, u of the command, s.
 
 Results go to standard output, everything else to standard error.
+
 Exit status: 0 done; 1 the rule gives no gains; 2 the command line is wrong.
 
 Examples:
@@ -439,33 +441,23 @@ Examples:
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line."""
-
-    def error(self, message: str) -> NoReturn:
-        say(PROGRAM, f"{message}; tune --help shows what it takes")
-        sys.exit(2)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command.
 
     :param arguments: those of the command line; default: the process's own.
     :return: the exit status.
     """
-    given = sys.argv[1:] if arguments is None else arguments
     parser = _parser()
-    options = parser.parse_args(with_negative(given))
+    options = parser.parse_args(arguments)
     return run_command(PROGRAM, lambda: _run(parser, options))
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog=PROGRAM,
+def _parser() -> Parser:
+    parser = Parser(
+        PROGRAM,
         usage="%(prog)s [MODEL | flags of the model] [options]",
         description="Compute controller gains from a model of the process.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "document", nargs="?", metavar="MODEL", help="JSON document with the model; -: from stdin"

@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Any
 from relay_autotune.cli.arguments import (
     DONE,
     NOTHING_FOUND,
+    Parser,
     add_web,
     check_web,
     guarded_in_graph,
@@ -41,7 +42,6 @@ from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN
 from relay_autotune.cli.settings import FLAGS, Kind, add_settings, kind_of
 from relay_autotune.cli.terminal import (
     GoBack,
-    Help,
     Signals,
     Working,
     agrees,
@@ -84,34 +84,34 @@ def main(args: Sequence[str] | None = None) -> int:
     return guarded_in_graph(PROGRAM, work)
 
 
-def _require_consistent(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+def _require_consistent(parser: Parser, options: argparse.Namespace) -> None:
     """End the program if some options contradict each other."""
     if options.amplitude < 0.0 or options.wait < 0.0:
-        parser.error("--amplitude and --wait are at least 0")
+        parser.refuse("--amplitude and --wait are at least 0")
     if options.sample_period is not None and options.sample_period <= 0.0:
-        parser.error(f"--sample-period is {options.sample_period:g}, expected more than 0 s")
+        parser.refuse(f"--sample-period is {options.sample_period:g}, expected more than 0 s")
     if options.web and (options.dry_run or options.json or options.report or options.export):
-        parser.error(
+        parser.refuse(
             "--web has check, result, report and exports on its page: leave out --dry-run, "
             "--json, --report and --output"
         )
     if options.export in EXPORTS:
-        parser.error(f"--export takes a file; give the program as --law {options.export}, and the "
-                     "file as --output FILE")  # fmt: skip
+        parser.refuse(
+            f"--export takes a file; give the program as --law {options.export}, and the file as "
+            "--output FILE"
+        )
     if options.step is not None and (
         options.verify is False or (options.yes and not options.verify)
     ):
-        parser.error("--step is that of the proof, which is not wanted here: give --verify, too")
+        parser.refuse("--step is that of the proof, which is not wanted here: give --verify, too")
     if options.verify and (options.web or options.json or options.record_only or options.dry_run):
-        parser.error(
+        parser.refuse(
             "--verify proves the gains of a tune that prints them: leave out --web, --json, "
             "--record-only and --dry-run"
         )
 
 
-def _require_no_parameter(
-    parser: argparse.ArgumentParser, options: argparse.Namespace, ros: list[str]
-) -> None:
+def _require_no_parameter(parser: Parser, options: argparse.Namespace, ros: list[str]) -> None:
     """End the program if a parameter is given that only relay_node has."""
     for flag, given in pairwise(ros):
         name, is_set, value = given.partition(":=")
@@ -122,7 +122,7 @@ def _require_no_parameter(
         do = f"give {FLAGS[name]} {value}" if name in FLAGS else "leave it out"
         if name not in FLAGS and not (options.measurement or options.joint):
             do = typed_for_parameter(node, name, value)
-        parser.error(f"{flag} {given} sets nothing in relay_node: {do}")
+        parser.refuse(f"{flag} {given} sets nothing in relay_node: {do}")
 
 
 def _apart(given: list[str]) -> tuple[list[str], list[str]]:
@@ -135,11 +135,10 @@ def _apart(given: list[str]) -> tuple[list[str], list[str]]:
     return given[:start] + rest[end + 1 :], rest[:end]
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=PROGRAM,
+def _parser() -> Parser:
+    parser = Parser(
+        PROGRAM,
         description=__doc__,
-        formatter_class=Help,
         epilog="Example:\n  tune_loop --namespace tank --amplitude 0.5 --report tank.html",
     )
     add_settings(parser)

@@ -500,7 +500,7 @@ def test_wrong_usage_has_status_2(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
         replay.main(arguments)
     assert caught.value.code == 2
-    assert "usage: replay" in capsys.readouterr().err
+    assert "replay --help shows what it takes" in capsys.readouterr().err
 
 
 def test_a_constant_measurement_in_an_experiment_is_said(tmp_path, capsys):
