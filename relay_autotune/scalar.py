@@ -26,7 +26,7 @@ def minimum_near(
     :param i: index of the point, of which an end has a neighbour on one side only.
     :param tolerance: of the place.
     """
-    # A controller runs without scipy.
+    # A controller runs without scipy.optimize.
     from scipy.optimize import minimize_scalar
 
     bounds = float(grid[max(i - 1, 0)]), float(grid[min(i + 1, grid.size - 1)])
@@ -45,14 +45,14 @@ def root(
     :param high: the other.
     :param tolerance: of a root near zero, where the relative one of the numbers would not do.
     """
+    # A controller runs without scipy.optimize.
+    from scipy.optimize import brentq
+
     at_low, at_high = function(low), function(high)
     if at_low * at_high >= 0.0:
         return low if abs(at_low) <= abs(at_high) else high
-
-    def of_cell(place: FloatArray) -> FloatArray:
-        return np.array([function(float(place[0]))])
-
-    return float(roots(of_cell, np.array([low]), np.array([high]), tolerance)[0])
+    accuracy = {"xtol": tolerance, "rtol": 2.0 * EXACT, "maxiter": _MOST_STEPS}
+    return float(brentq(function, low, high, **accuracy, disp=False))
 
 
 def roots(
