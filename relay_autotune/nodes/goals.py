@@ -9,6 +9,7 @@ import math
 import re
 import time
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse
@@ -81,7 +82,7 @@ class OneGoal:
         kind: Any,
         name: str,
         begin: Callable[[Any], None],
-        cancel: Callable[[], None],
+        cancel: Callable[..., None],
         **options: Any,
     ) -> None:
         self._node = node
@@ -158,14 +159,29 @@ def refused(reason: Reason) -> StartTune.Response:
     return answer
 
 
+@dataclass
+class _Tune:
+    """A goal that is not answered yet.
+
+    :param goal: its handle.
+    """
+
+    goal: Any
+    result: Tune.Result = field(default_factory=Tune.Result)
+    newest: TransferFunction = field(default_factory=TransferFunction)
+    """Model that is not told yet."""
+    model: Any = None
+    """The newest model, which is kept beyond the feedback that tells it."""
+
+
 class TuneAction(OneGoal):
-    """Serve the action.
+    """Serve the action. A tune may begin while the one before waits for its gains.
 
     :param node: the node.
     :param ready: returns once a tune may be asked for.
     :param start: takes an amplitude [u] and whether it is a dry run; starts or checks a tune, and
         says what became of it.
-    :param cancel: called when a client cancels the running tune.
+    :param cancel: called with the id of an experiment when its client cancels it.
     """
 
     def __init__(
@@ -173,21 +189,19 @@ class TuneAction(OneGoal):
         node: ServedNode,
         ready: Callable[[], Awaitable[None]],
         start: Callable[[float, bool], StartTune.Response],
-        cancel: Callable[[], None],
+        cancel: Callable[[str], None],
     ) -> None:
         super().__init__(
             node, Tune, "~/tune", self._accept, cancel, status_pub_qos_profile=quality.STATUS
         )
         self._ready, self._start = ready, start
-        self._forget("")
+        self._tunes: dict[str, _Tune] = {}
 
-    def _forget(self, experiment_id: str) -> None:
-        """Begin an experiment without results."""
-        self._id = experiment_id
-        self._result = Tune.Result()
-        self._newest = TransferFunction()
-        # The newest model, which is kept beyond the feedback that tells it.
-        self._model: Any = None
+    def _on_cancel(self, goal: Any) -> CancelResponse:
+        for experiment_id, tune in self._tunes.items():
+            if goal.goal_id == tune.goal.goal_id:
+                self._node.executor.create_task(self._cancel, experiment_id)
+        return CancelResponse.ACCEPT
 
     def _accept(self, goal: Any) -> None:
         self._node.executor.create_task(self._begin, goal)
@@ -200,8 +214,7 @@ class TuneAction(OneGoal):
         else:
             started = self._start(request.amplitude, request.dry_run)
         if started.experiment_id:
-            self.running = goal
-            self._forget(started.experiment_id)
+            self._tunes[started.experiment_id] = _Tune(goal)
             return
         result = Tune.Result(
             reason=started.reason,
@@ -211,13 +224,15 @@ class TuneAction(OneGoal):
         )
         conclude(goal, result, succeeded=started.accepted)
 
-    def tell(self, experiment: RelayExperiment, status: str) -> None:
-        """Publish feedback, if a goal is active.
+    def tell(self, experiment_id: str, experiment: RelayExperiment, status: str) -> None:
+        """Publish feedback, if the experiment has a goal.
 
-        :param experiment: the running experiment.
+        :param experiment_id: its id.
+        :param experiment: what it sees.
         :param status: what it waits for and what it sees, a sentence.
         """
-        if self.running is None:
+        tune = self._tunes.get(experiment_id)
+        if tune is None:
             return
         # The probe is a second kick.
         state = State.KICK if experiment.state is State.PROBE else experiment.state
@@ -229,18 +244,18 @@ class TuneAction(OneGoal):
             remaining=experiment.remaining,
             period=math.nan,
             amplitude=math.nan,
-            ultimate_gain=self._model.ultimate_gain if self._model else math.nan,
-            ultimate_gain_std=self._model.ultimate_gain_std if self._model else math.nan,
-            transfer_function=self._newest,
+            ultimate_gain=tune.model.ultimate_gain if tune.model else math.nan,
+            ultimate_gain_std=tune.model.ultimate_gain_std if tune.model else math.nan,
+            transfer_function=tune.newest,
             status=status,
         )
         if experiment.cycle_count:
             last = experiment.cycles[-1]
             feedback.period = last.period
             feedback.amplitude = last.amplitude
-        self.running.publish_feedback(feedback)
+        tune.goal.publish_feedback(feedback)
         # Each model is told once, since it is long.
-        self._newest = TransferFunction()
+        tune.newest = TransferFunction()
 
     def note(self, name: str, message: Any) -> None:
         """Keep a model or gains for the result.
@@ -248,14 +263,15 @@ class TuneAction(OneGoal):
         :param name: unresolved name of its topic.
         :param message: the message.
         """
-        if self.running is None or message.experiment_id != self._id:
+        tune = self._tunes.get(message.experiment_id)
+        if tune is None:
             return
         if name == "transfer_function":
-            self._newest = self._model = message
+            tune.newest = tune.model = message
             if message.final:
-                self._result.transfer_function = message
+                tune.result.transfer_function = message
         elif message.final:
-            self._result.gains = message
+            tune.result.gains = message
 
     def end(self, experiment_id: str, summary: Any, bag: str, missing: str) -> None:
         """Answer the goal of an experiment; do nothing if it has no goal.
@@ -265,10 +281,10 @@ class TuneAction(OneGoal):
         :param bag: folder of the recording; empty: no recording.
         :param missing: a sentence on samples or results that are missing; empty: none are.
         """
-        goal = self.running
-        if goal is None or experiment_id != self._id:
+        tune = self._tunes.pop(experiment_id, None)
+        if tune is None:
             return
-        result = self._result
+        result = tune.result
         result.experiment = summary
         result.bag = bag
         result.outcome = summary.outcome
@@ -281,5 +297,4 @@ class TuneAction(OneGoal):
         result.verdict_why = judged.verdict_why
         if not (judged.verdict_reason or given):
             result.verdict_why = result.why
-        self.running = None
-        conclude(goal, result, succeeded=summary.outcome == Tune.Result.COMPLETED)
+        conclude(tune.goal, result, succeeded=summary.outcome == Tune.Result.COMPLETED)

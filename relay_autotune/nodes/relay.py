@@ -94,7 +94,8 @@ class RelayNode(ServedNode):
         self.create_service(StartTune, "~/start_tune", self._on_start, callback_group=waiting)
         serve(self, Trigger, "~/abort", self._abort)
         self._action = TuneAction(self, self._arrival.is_over, self._request, self._cancel)
-        self._awaits_results: Session | None = None
+        # Those whose gains are awaited, by their ids.
+        self._waiting: dict[str, Session] = {}
         self._narrator = Narrator(self, self._words, self._tell)
         self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         ask_before_changes(self, lambda given: require_settable(self, given, self._running))
@@ -302,11 +303,12 @@ class RelayNode(ServedNode):
         if (session := self._session) is not None:
             self._stop(session, reason)
 
-    def _cancel(self) -> None:
+    def _cancel(self, experiment_id: str) -> None:
         """End a tune at its client's wish, also one that waits for its model alone."""
-        self._stop_now(Code.CANCELLED())
-        if self._awaits_results is not None:
-            self._awaits_results.recording.wait_no_longer("cancelled")
+        if experiment_id == self._running:
+            self._stop_now(Code.CANCELLED())
+        elif experiment_id in self._waiting:
+            self._waiting[experiment_id].recording.wait_no_longer("cancelled")
 
     def _stop(self, session: Session, reason: Reason) -> bool:
         """End a running tune; return True if the safe command was acknowledged."""
@@ -348,12 +350,12 @@ class RelayNode(ServedNode):
         if session.sample_count:
             self._results.experiment(message)
         session.recording.message("relay_experiment", session.now_ns(), message)
-        self._awaits_results = session
-        self._action.tell(experiment, experiment.status)
+        self._waiting[session.id] = session
+        self._action.tell(session.id, experiment, experiment.status)
         self.tidy_when_idle()
 
         def closed(missing: str) -> None:
-            self._awaits_results = None
+            del self._waiting[session.id]
             bag = "" if self._recordings.problem() else str(session.recording.path)
             summary = session.message(arrays=False)
             self._action.end(session.id, summary, bag, "; ".join(filter(None, (lost, missing))))
@@ -386,8 +388,8 @@ class RelayNode(ServedNode):
     def _words(self) -> str:
         """Say what the tune waits for and sees; empty where none runs or waits for its model."""
         if (session := self._session) is None:
-            waiting = self._awaits_results
             timeout = self.get_parameter("model_timeout").value
+            waiting = self._last_waiting
             return "" if waiting is None else waiting.recording.awaited(timeout)
         sentence = session.experiment.status
         if (age := self._sensor.age) > max(SILENT, 2.0 * self._sensor.samples.interval):
@@ -397,8 +399,12 @@ class RelayNode(ServedNode):
 
     def _tell(self, status: str) -> None:
         """Send feedback of the tune that runs, or that waits for its model."""
-        if (session := self._session or self._awaits_results) is not None:
-            self._action.tell(session.experiment, status)
+        if (session := self._session or self._last_waiting) is not None:
+            self._action.tell(session.id, session.experiment, status)
+
+    @property
+    def _last_waiting(self) -> Session | None:
+        return next(reversed(self._waiting.values()), None)
 
     def _lost(self) -> int:
         # Sequence numbers of several publishers cannot be distinguished.

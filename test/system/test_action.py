@@ -113,3 +113,25 @@ def test_a_cancelled_goal_leaves_the_safe_command_and_no_gains(rig: Rig) -> None
     assert "cancelled" in result.reason
     assert not result.gains.experiment_id
     rig.until(lambda: commands[-1].data == 1.0, "the safe command")
+
+
+def test_a_goal_that_waits_for_its_gains_ends_beside_the_next_one(rig: Rig) -> None:
+    rig.plant(**LOOP, seed=3)
+    rig.relay(amplitude=0.5, baseline=1.0, sample_period=0.1, model_timeout=300.0)
+    wait_for_the_graph(rig)
+    # No identifier_node answers.
+    first = Goal(rig)
+    rig.until(
+        lambda: any(f.state == Tune.Feedback.STATE_COMPLETED for f in first.feedback), "its end"
+    )
+    second = Goal(rig)
+    rig.until(lambda: bool(second.feedback), "the second tune")
+    first.handle.cancel_goal_async()
+    status, result = first.result()
+    assert status == GoalStatus.STATUS_CANCELED
+    assert result.outcome == Tune.Result.COMPLETED
+    assert "cancelled" in result.reason
+    second.handle.cancel_goal_async()
+    status, other = second.result()
+    assert status == GoalStatus.STATUS_CANCELED
+    assert other.experiment.experiment_id != result.experiment.experiment_id
