@@ -146,8 +146,7 @@ class AfterTune(Tuned):
         again = prefix() + shlex.join([PROGRAM, *words])
         if result.gains.experiment_id:
             # Nodes that end with this command cannot prove them later.
-            wanted = loop.proves and proven is None
-            return [("prove the gains", f"{again} --verify")] if wanted else []
+            return self._to_prove("") if loop.proves and proven is None else []
         if result.outcome == result.COMPLETED:
             return []
         if result.why.code == Code.NODE_FAILED:
@@ -249,9 +248,22 @@ class AfterTune(Tuned):
             self._write(written, file)
         if written.gains is not gains and not against:
             law = {"law": written.gains.law, "sample_period": written.gains.law_period}
-            again = as_typed(PROGRAM, self.parser, options, verify=None, **law)
-            steps.append((f"prove those for {written.how}", f"{prefix()}{again} --verify"))
+            steps += self._to_prove(written.how, **law)
         return proven, steps
+
+    def _to_prove(self, how: str, **law: Any) -> Steps:
+        """Return the command that makes the tune again, and proves its gains.
+
+        :param how: the program that they are for; empty: that of the tune.
+        :param law: options that ask for its law.
+        """
+        options, file = self.options, self.options.export
+        law["export"] = None if file and Path(file).exists() else file
+        # Doubtful gains are proven where a person agrees.
+        law["yes"] = options.yes and not self.doubt
+        again = as_typed(PROGRAM, self.parser, options, verify=None, **law)
+        what = f"prove those for {how}" if how else "prove the gains"
+        return [(what, f"{prefix()}{again}{'' if self.doubt else ' --verify'}")]
 
     def _write(self, written: _Written, file: str) -> None:
         # The tune is made, and its recording has the gains.
@@ -266,7 +278,13 @@ class AfterTune(Tuned):
         except SelectionError as error:
             say(PROGRAM, f"{file} is not written: {error}, such as {again}")
             return
-        write(text, file)
+        try:
+            write(text, file)
+        except SelectionError as error:
+            if self.options.export:
+                raise
+            say(PROGRAM, f"{error}; to have the gains: {again}")
+            return
         print(f"  {'gains for':<16} {written.how}: {Path(file).resolve()}")
 
     def _asked(self, first: _Written, against: str) -> tuple[_Written, str]:

@@ -58,7 +58,14 @@ _FOUND_WITHIN = 5.0
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
     given = list(sys.argv[1:] if args is None else args)
-    options = _parser().parse_args(given)
+    parser = _parser()
+    options = parser.parse_args(given)
+    asked = {
+        "--revert": options.revert, "--file": options.file,
+        "--verify-only": options.verify_only, "--no-verify": options.no_verify,
+    }  # fmt: skip
+    if len(alone := [flag for flag, value in asked.items() if value]) > 1:
+        parser.refuse(f"{' and '.join(alone)} ask for different things: give one of them")
     import relay_autotune.nodes.gains_client  # noqa: F401  see run_command
 
     return guarded_in_graph(PROGRAM, lambda graph: _work(options, graph))

@@ -235,8 +235,8 @@ def cautions(
     if known and noise > _HELD * options.noise_share * options.amplitude:
         found.append(
             f"the noise alone moves the command by {noise:.3g} u (standard deviation), "
-            f"{100.0 * noise / options.amplitude:.0f} % of half the command's range; filter the "
-            f"measurement{', or ask for controller pi' if controller.td else ''}"
+            f"{100.0 * noise / options.amplitude:.0f} % of the amplitude of the test; filter "
+            f"the measurement{', or ask for controller pi' if controller.td else ''}"
         )
     return (*found, task.too_slow) if task.too_slow else tuple(found)
 

@@ -381,3 +381,11 @@ def test_a_command_line_that_does_not_fit_ends_with_two() -> None:
     with pytest.raises(SystemExit) as end:
         apply_gains.main(["--step", "nan"])
     assert end.value.code == 2
+
+
+def test_two_wishes_at_once_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        apply_gains.main(["--revert", "--file", "gains.yaml"])
+    assert caught.value.code == 2
+    said = capsys.readouterr().err
+    assert said == "apply_gains: --revert and --file ask for different things: give one of them\n"

@@ -816,6 +816,11 @@ def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
     found = ended(core.NONE, gains=PidGains(experiment_id="x"))
     assert repeated(found, None) == [("prove the gains", f"{again} --verify")]
     assert repeated(found, True) == []
+    # The file is written, and what is doubtful is proven only where a person agrees.
+    given.export, given.yes = __file__, True
+    assert repeated(found, None) == [("prove the gains", f"{again} --yes --verify")]
+    found.verdict, found.verdict_reason = Tune.Result.VERDICT_DOUBTFUL, "clipped"
+    assert repeated(found, None) == [("prove the gains", again)]
 
 
 @pytest.fixture

@@ -237,7 +237,7 @@ def test_gains_carry_what_the_user_must_know():
     gains = design(DesignTask(model=model, options=loud), "ziegler_nichols")
     assert any("Ms is" in w and "above the 1.4" in w for w in gains.warnings)
     told = f"moves the command by {0.5 * gains.noise_gain:.3g} u (standard deviation)"
-    assert any(told in w and "of half the command's range" in w for w in gains.warnings)
+    assert any(told in w and "of the amplitude of the test" in w for w in gains.warnings)
     gains = design(DesignTask(model=model), "robust")
     assert gains.warnings == ()
     # The noise of a controller whose sampling period is not known cannot be told.
