@@ -533,4 +533,11 @@ class LoopClient:
         return sorted({name.removesuffix(ending) for name in goals if name.endswith(ending)})
 
     def _resolved(self, topic: str) -> str:
+        try:
+            validate_topic_name(topic)
+        except InvalidTopicNameException as error:
+            text = str(error).splitlines()[0].removeprefix("Invalid topic name: ").rstrip(":")
+            raise ParameterError(
+                f"no topic can be {topic!r}: {text}; give one such as /tank/level"
+            ) from None
         return str(self._node.resolve_topic_name(topic))

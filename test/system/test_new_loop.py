@@ -252,6 +252,19 @@ def test_a_topic_that_is_not_there_is_told_with_the_nearest(rig: Rig) -> None:
     assert "type --measurement /tank/level" in told
 
 
+def test_what_cannot_be_a_topic_is_refused_in_one_line(rig: Rig) -> None:
+    words = [word.replace("/tank/level", "/tank/le vel") for word in WORDS]
+    done = subprocess.run(
+        [shutil.which("tune_loop"), *words],
+        env=rig.environment, capture_output=True, text=True, timeout=60.0, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    told = done.stderr.splitlines()[-1]
+    assert told.startswith(
+        "tune_loop: no topic can be '/tank/le vel': topic name must not contain"
+    )
+
+
 def test_a_sensor_of_less_than_one_sample_a_second_is_tuned(rig: Rig) -> None:
     heard = rig.listen("/tank/valve", Float64, RELIABLE)
     slow = {"sample_period": 1.2, "time_constants": [4.0], "dead_time": 1.0}
