@@ -58,14 +58,7 @@ _FOUND_WITHIN = 5.0
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
     given = list(sys.argv[1:] if args is None else args)
-    parser = _parser()
-    options = parser.parse_args(given)
-    asked = {
-        "--revert": options.revert, "--file": options.file,
-        "--verify-only": options.verify_only, "--no-verify": options.no_verify,
-    }  # fmt: skip
-    if len(alone := [flag for flag, value in asked.items() if value]) > 1:
-        parser.refuse(f"{' and '.join(alone)} ask for different things: give one of them")
+    options = _parser().parse_args(given)
     import relay_autotune.nodes.gains_client  # noqa: F401  see run_command
 
     return guarded_in_graph(PROGRAM, lambda graph: _work(options, graph))
@@ -93,12 +86,13 @@ def _parser() -> Parser:
     parser.add_argument(
         "--accept-doubtful", action="store_true", help="also gains whose verdict is not trusted"
     )
-    parser.add_argument(
+    one = parser.add_mutually_exclusive_group()
+    one.add_argument(
         "--verify-only", action="store_true", help="verify the gains that are in force"
     )
-    parser.add_argument("--no-verify", action="store_true", help="apply them without a step")
-    parser.add_argument("--revert", action="store_true", help="take the gains before back")
-    parser.add_argument(
+    one.add_argument("--no-verify", action="store_true", help="apply them without a step")
+    one.add_argument("--revert", action="store_true", help="take the gains before back")
+    one.add_argument(
         "--file", metavar="FILE",
         help="write the gains, for controller_node or the law that they are for; apply nothing",
     )  # fmt: skip
