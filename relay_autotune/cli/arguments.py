@@ -75,7 +75,7 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(shown, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """End the process, and say where it stands what there is.
+        """Refuse the command line, and say where it is read what it takes.
 
         :param message: what is wrong.
         """
