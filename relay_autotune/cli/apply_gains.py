@@ -112,6 +112,9 @@ def _work(options: argparse.Namespace, graph: ExitStack) -> int:
         return _write(client, options)
     client.find(_FOUND_WITHIN)
     if options.revert:
+        if not agrees("Take the gains before back?", yes=options.yes):
+            say(PROGRAM, "nothing was changed")
+            return NOTHING_FOUND
         print(client.ask("revert"))
         return DONE
     in_force, _ = apply_and_verify(client, options)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -30,6 +30,7 @@ from relay_autotune.exchange.messages import fill_gains, fill_reason
 from relay_autotune.loop.analysis import performance_beside
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import Limits
+from relay_autotune.nodes import gains_client
 from relay_autotune.nodes.gains_client import GainsClient, StepsHere
 from relay_autotune.nodes.loop_client import GoneError
 from relay_autotune.process.transfer_function import TransferFunction
@@ -389,3 +390,25 @@ def test_two_wishes_at_once_are_refused(capsys: pytest.CaptureFixture[str]) -> N
     assert caught.value.code == 2
     said = capsys.readouterr().err
     assert said.startswith("apply_gains: argument --file: not allowed with argument --revert;")
+
+
+@pytest.mark.parametrize("agreed", [True, False])
+def test_the_gains_before_are_taken_back_after_a_yes(
+    agreed: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[str] = []
+
+    def ask(what: str) -> str:
+        asked.append(what)
+        return "kc 0.1 in force again"
+
+    client = SimpleNamespace(find=lambda patience: None, ask=ask)
+    monkeypatch.setattr(gains_client, "GainsClient", lambda *_: nullcontext(client))
+    monkeypatch.setattr(apply_gains, "agrees", lambda question, yes: agreed)
+    with ExitStack() as graph:
+        status = apply_gains._work(apply_gains._parser().parse_args(["--revert"]), graph)
+    assert (status, asked) == ((0, ["revert"]) if agreed else (1, []))
+    out, err = capsys.readouterr()
+    assert (out, err) == (
+        ("kc 0.1 in force again\n", "") if agreed else ("", "apply_gains: nothing was changed\n")
+    )
