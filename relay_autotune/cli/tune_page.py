@@ -135,7 +135,8 @@ class _LoopOnPage:
                 elif wish.dry:
                     self._show_plan(wish)
                 elif wish.what == START:
-                    status = self._tune(wish) or status
+                    tuned = self._tune(wish)
+                    status = status if tuned is None else tuned
                 else:
                     with self._commands_shown():
                         self._gains.do(wish)
@@ -215,15 +216,15 @@ class _LoopOnPage:
         self._loop.before_tune()
         self._live.tell(limits=tuple(self._options.within or ()))
 
-    def _tune(self, wish: PageCommand) -> int:
-        """Tune until the result is there."""
+    def _tune(self, wish: PageCommand) -> int | None:
+        """Tune until the result is there; return its exit status, None: it was not asked for."""
         client, live = self._client, self._live
         before = live.told
         try:
             self._take(wish)
         except RelayAutotuneError as error:
             live.rest(str(error), good=False)
-            return DONE
+            return None
         live.forget_questions()
         self._cycles.clear()
         self._ultimate, self._ends = {}, []
