@@ -140,13 +140,10 @@ class AfterTune(Tuned):
         :param proven: whether its gains passed; None: they were not tried.
         """
         result, options, loop = self.result, self.options, self.loop
-        words = options.typed
-        if loop.proves:
-            words = shlex.split(as_typed(PROGRAM, self.parser, options, verify=None))[1:]
-        again = prefix() + shlex.join([PROGRAM, *words])
         if result.gains.experiment_id:
             # Nodes that end with this command cannot prove them later.
-            return self._to_prove("") if loop.proves and proven is None else []
+            wanted = loop.proves and proven is None
+            return [self._to_prove("prove the gains")] if wanted else []
         if result.outcome == result.COMPLETED:
             return []
         if result.why.code == Code.NODE_FAILED:
@@ -154,6 +151,10 @@ class AfterTune(Tuned):
             return [
                 ("report it", "this is a defect: send its reason, and the recording if you can")
             ]
+        words = options.typed
+        if loop.proves:
+            words = shlex.split(as_typed(PROGRAM, self.parser, options, verify=None))[1:]
+        again = prefix() + shlex.join([PROGRAM, *words])
         steps = loop.again(again)
         if result.why.code == Code.SILENT_SENSOR:
             why = reason_from_message(result.why)
@@ -248,22 +249,21 @@ class AfterTune(Tuned):
             self._write(written, file)
         if written.gains is not gains and not against:
             law = {"law": written.gains.law, "sample_period": written.gains.law_period}
-            steps += self._to_prove(written.how, **law)
+            steps.append(self._to_prove(f"prove those for {written.how}", **law))
         return proven, steps
 
-    def _to_prove(self, how: str, **law: Any) -> Steps:
-        """Return the command that makes the tune again, and proves its gains.
+    def _to_prove(self, what: str, **law: Any) -> tuple[str, str]:
+        """Return the command that makes the tune again and proves its gains, with its purpose.
 
-        :param how: the program that they are for; empty: that of the tune.
-        :param law: options that ask for its law.
+        :param what: the purpose.
+        :param law: options that ask for the law of another program.
         """
         options, file = self.options, self.options.export
         law["export"] = None if file and Path(file).exists() else file
         # Doubtful gains are proven where a person agrees.
         law["yes"] = options.yes and not self.doubt
         again = as_typed(PROGRAM, self.parser, options, verify=None, **law)
-        what = f"prove those for {how}" if how else "prove the gains"
-        return [(what, f"{prefix()}{again}{'' if self.doubt else ' --verify'}")]
+        return what, f"{prefix()}{again}{'' if self.doubt else ' --verify'}"
 
     def _write(self, written: _Written, file: str) -> None:
         # The tune is made, and its recording has the gains.
