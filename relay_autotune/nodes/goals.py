@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Services and actions: one goal at a time, what it tells, its end; the action ~/tune."""
+"""Services and actions: their goals, what they tell, how they end; the action ~/tune."""
 
 from __future__ import annotations
 
@@ -62,8 +62,15 @@ class Narrator:
         self._tell(words)
 
 
-class OneGoal:
-    """Serve an action of which one goal runs at a time; no callback waits for its end.
+def serve_goals(
+    node: ServedNode,
+    kind: Any,
+    name: str,
+    begin: Callable[[Any], None],
+    cancel: Callable[[Any], None],
+    **options: Any,
+) -> ActionServer:
+    """Serve an action, of which no callback waits for the end of a goal.
 
     A goal is always accepted, because a rejection carries no reason. A goal that cannot begin ends
     at once as aborted, with the reason in its result.
@@ -71,39 +78,25 @@ class OneGoal:
     :param node: the node.
     :param kind: class of the action.
     :param name: of the action.
-    :param begin: called with each accepted goal; sets `running`, or concludes it.
-    :param cancel: called when a client cancels the running goal.
+    :param begin: called with the handle of each accepted goal, which it keeps or concludes.
+    :param cancel: called with the handle of a goal that its client cancels.
     :param options: of the `ActionServer`.
     """
 
-    def __init__(
-        self,
-        node: ServedNode,
-        kind: Any,
-        name: str,
-        begin: Callable[[Any], None],
-        cancel: Callable[..., None],
-        **options: Any,
-    ) -> None:
-        self._node = node
-        self._cancel = cancel
-        self.running: Any = None
-        """Handle of the goal that runs; None: none does."""
-        # Its callback for execution is needed by the constructor alone: each goal has its own.
-        self._server = ActionServer(
-            node,
-            kind,
-            name,
-            lambda _: kind.Result(),
-            handle_accepted_callback=begin,
-            cancel_callback=self._on_cancel,
-            **options,
-        )
-
-    def _on_cancel(self, goal: Any) -> CancelResponse:
-        if self.running is not None and goal.goal_id == self.running.goal_id:
-            self._node.executor.create_task(self._cancel)
+    def on_cancel(goal: Any) -> CancelResponse:
+        node.executor.create_task(cancel, goal)
         return CancelResponse.ACCEPT
+
+    return ActionServer(
+        node,
+        kind,
+        name,
+        # Needed by the constructor alone: each goal has its own.
+        lambda _: kind.Result(),
+        handle_accepted_callback=begin,
+        cancel_callback=on_cancel,
+        **options,
+    )
 
 
 def serve(node: Node, kind: Any, name: str, work: Callable[[Any], Any], **options: Any) -> None:
@@ -174,7 +167,7 @@ class _Tune:
     """The newest model, which is kept beyond the feedback that tells it."""
 
 
-class TuneAction(OneGoal):
+class TuneAction:
     """Serve the action. A tune may begin while the one before waits for its gains.
 
     :param node: the node.
@@ -191,17 +184,17 @@ class TuneAction(OneGoal):
         start: Callable[[float, bool], StartTune.Response],
         cancel: Callable[[str], None],
     ) -> None:
-        super().__init__(
-            node, Tune, "~/tune", self._accept, cancel, status_pub_qos_profile=quality.STATUS
-        )
-        self._ready, self._start = ready, start
+        self._node, self._ready, self._start, self._cancel = node, ready, start, cancel
         self._tunes: dict[str, _Tune] = {}
+        self._server = serve_goals(
+            node, Tune, "~/tune", self._accept, self._on_cancel,
+            status_pub_qos_profile=quality.STATUS,
+        )  # fmt: skip
 
-    def _on_cancel(self, goal: Any) -> CancelResponse:
-        for experiment_id, tune in self._tunes.items():
+    def _on_cancel(self, goal: Any) -> None:
+        for experiment_id, tune in [*self._tunes.items()]:
             if goal.goal_id == tune.goal.goal_id:
-                self._node.executor.create_task(self._cancel, experiment_id)
-        return CancelResponse.ACCEPT
+                self._cancel(experiment_id)
 
     def _accept(self, goal: Any) -> None:
         self._node.executor.create_task(self._begin, goal)

@@ -25,7 +25,7 @@ from relay_autotune.exchange.messages import fill_reason, reason_from_message, s
 from relay_autotune.experiment.settling import rest_state, slow_movement
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.goals import Narrator, OneGoal, conclude
+from relay_autotune.nodes.goals import Narrator, conclude, serve_goals
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.nodes.results import keep
 from relay_autotune.process.transfer_function import TransferFunction
@@ -220,14 +220,14 @@ class Verifier:
         self._full = quality.publisher(
             node, Verification, "verification", quality.latched(_STEPS_KEPT)
         )
-        self._action = OneGoal(
-            node, Verify, "~/verify", self._accept, partial(self.interrupt, Code.CANCELLED())
-        )
+        # The handle of the goal that runs.
+        self._goal: Any = None
+        self._server = serve_goals(node, Verify, "~/verify", self._accept, self._cancel)
 
     @property
     def is_running(self) -> bool:
         """True from the acceptance of a goal to its end."""
-        return self._action.running is not None
+        return self._goal is not None
 
     @property
     def rested_at(self) -> float:
@@ -238,14 +238,14 @@ class Verifier:
 
     def _accept(self, goal: Any) -> None:
         patience, why = goal.request.patience, NONE
-        if self._action.running is not None:
+        if self._goal is not None:
             why = Code.VERIFYING()
         elif not 0.0 <= patience <= LONGEST_TIME:
             why = other(f"patience is {patience:g} s, expected 0 to {LONGEST_TIME:g} s")
         if why:
             conclude(goal, _result(False, why, str(why)), succeeded=False)
             return
-        self._action.running, self._over, self._found = goal, None, []
+        self._goal, self._over, self._found = goal, None, []
         self._waits_for, self._is_settling = "", False
         self._until = time.monotonic() + _PREPARED_WITHIN + patience
         self._watch.reset()
@@ -268,7 +268,7 @@ class Verifier:
         except Exception as error:  # noqa: BLE001
             reason = f"{reason}; {_why(error)}"
         self._watch.cancel()
-        self._action.running = None
+        self._goal = None
         result = _result(passed is True, why, reason, self._found)
         conclude(goal, result, succeeded=succeeded)
 
@@ -482,7 +482,7 @@ class Verifier:
 
     def _words(self) -> str:
         """Say what the verification waits for and sees; empty where none runs."""
-        if self._action.running is None or self._over is not None:
+        if self._goal is None or self._over is not None:
             return ""
         if (trial := self._trial) is None:
             return self._waits_for or "computing what the step will do"
@@ -497,16 +497,20 @@ class Verifier:
         return f"step {trial.number} of {trial.of}, {what}, {now}"
 
     def _tell(self, status: str) -> None:
-        if self._action.running is None:
+        if self._goal is None:
             return
         feedback = Verify.Feedback(step=1, status=status)
         if (trial := self._trial) is not None:
             feedback.step = trial.number
             feedback.elapsed = self._recent[-1][0] - self._begun
             feedback.remaining = max(self._planned - feedback.elapsed, 0.0)
-        self._action.running.publish_feedback(feedback)
+        self._goal.publish_feedback(feedback)
 
     # Ending.
+
+    def _cancel(self, goal: Any) -> None:
+        if self._goal is not None and goal.goal_id == self._goal.goal_id:
+            self.interrupt(Code.CANCELLED())
 
     def interrupt(self, why: Reason) -> None:
         """End the verification without a verdict."""
@@ -530,7 +534,7 @@ class Verifier:
 
     def _end(self, passed: bool | None, why: Reason) -> None:
         """End the proof, unless it has ended or none runs."""
-        if self._action.running is None or self._over is not None:
+        if self._goal is None or self._over is not None:
             return
         self._over = passed, why
         if self._trial is not None:
