@@ -165,7 +165,27 @@ class ExperimentParameters:
         if baseline is not None:
             self._validate_levels(baseline)
 
+    def validate_limits(self) -> None:
+        """Refuse limits in the wrong order, which no amplitude of a start request mends.
+
+        :raises ParameterError: with a sentence that names the two and their values.
+        """
+        for signal in ("measurement", "command"):
+            low, high = getattr(self, f"{signal}_min"), getattr(self, f"{signal}_max")
+            if low >= high:
+                raise ParameterError(
+                    f"{signal}_min is {low:g}, expected less than {signal}_max, which is {high:g}"
+                )
+        if not math.isnan(self.setpoint) and not (
+            self.measurement_min < self.setpoint < self.measurement_max
+        ):
+            raise ParameterError(
+                f"setpoint is {self.setpoint:g}, expected between measurement_min "
+                f"{self.measurement_min:g} and measurement_max {self.measurement_max:g}"
+            )
+
     def _validate_together(self) -> None:
+        self.validate_limits()
         if self.finds_amplitude:
             limits = ("command_min", "command_max")
             lacking = [name for name in limits if not math.isfinite(getattr(self, name))]
@@ -185,19 +205,6 @@ class ExperimentParameters:
             raise ParameterError(
                 f"max_cycles is {self.max_cycles}, expected at least min_cycles, "
                 f"which is {self.min_cycles}"
-            )
-        for signal in ("measurement", "command"):
-            low, high = getattr(self, f"{signal}_min"), getattr(self, f"{signal}_max")
-            if low >= high:
-                raise ParameterError(
-                    f"{signal}_min is {low:g}, expected less than {signal}_max, which is {high:g}"
-                )
-        if not math.isnan(self.setpoint) and not (
-            self.measurement_min < self.setpoint < self.measurement_max
-        ):
-            raise ParameterError(
-                f"setpoint is {self.setpoint:g}, expected between measurement_min "
-                f"{self.measurement_min:g} and measurement_max {self.measurement_max:g}"
             )
         if 0.0 < self.max_duration <= self.settle_time:
             raise ParameterError(

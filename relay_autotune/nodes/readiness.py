@@ -381,7 +381,7 @@ def _policy_from(values: Mapping[str, Any], *, connected: bool) -> SafePolicy:
 
 
 def require_settable(node: Node, changes: Sequence[RosParameter], running: str) -> None:
-    """Refuse a change of parameters that is not possible now.
+    """Refuse a change of parameters that is not possible now; without one, what they are.
 
     :param node: relay_node.
     :param changes: the changes about to be made.
@@ -393,9 +393,9 @@ def require_settable(node: Node, changes: Sequence[RosParameter], running: str) 
         raise NotReadyError(Code.FIXED_NOW(tune=running, node=node.get_fully_qualified_name()))
     values = merged(node, TUNE_PARAMETERS, changes)
     experiment = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}
+    parameters = ExperimentParameters(**experiment)
     # A start request may still give the amplitude; then all is checked at the start.
-    if experiment["amplitude"] > 0.0:
-        ExperimentParameters(**experiment).validate()
+    parameters.validate() if parameters.amplitude > 0.0 else parameters.validate_limits()
 
 
 def _rest_of(samples: LastSamples) -> str | Reason:
@@ -461,7 +461,7 @@ def _expected(
 ) -> tuple[str, Mark]:
     """Say how far the measurement will swing: by the last tune, else as far as the levels grow.
 
-    A swing of given levels that goes beyond a limit is to be known: the tune would end there.
+    A swing that reaches a limit is a note: the tune would end there.
 
     :param parameters: the experiment's parameters.
     :param samples: the last measurements.
@@ -469,26 +469,27 @@ def _expected(
     """
     rest = samples.rest()
     low, high = parameters.measurement_min, parameters.measurement_max
+    limits = [f"{limit:g}" for limit in (low, high) if math.isfinite(limit)]
+    ends = f"; the tune ends at {' and '.join(limits)} y" if limits else ""
     if last is not None:
         amplitude, cycle = last
         ratio = parameters.amplitude / amplitude if parameters.amplitude else 1.0
-        swing = cycle.amplitude * ratio
+        swing, ends = cycle.amplitude * ratio, ""
         told = f"a swing of about {swing:.2g} y each way in {duration(cycle.period)}, as last time"
         if rest is None or parameters.finds_amplitude:
             return told, Mark.OK
-        beyond = [f"{end:g}" for end in (low, high) if abs(end - rest.mean) < swing]
-        if not beyond:
-            return told, Mark.OK
-        ends = f"it would end the tune at {' or '.join(beyond)} y: give wider limits"
-        return f"{told}; {ends}, or a smaller amplitude", Mark.NOTE
-    limits = [f"{limit:g}" for limit in (low, high) if math.isfinite(limit)]
-    ends = f"; the tune ends at {' and '.join(limits)} y" if limits else ""
-    if rest is None or not parameters.finds_amplitude:
+        mend = "give wider limits, or a smaller amplitude"
+    elif rest is None or not parameters.finds_amplitude:
         told = f"how far the measurement swings is not known before the first tune{ends}"
         return told, Mark.OK
-    seen, noise = np.array(samples.before()), rest.noise_std
-    clear = clear_swing(noise, parameters.band(noise), seen)
-    setpoint = rest.mean if math.isnan(parameters.setpoint) else parameters.setpoint
-    swing = sought_swing(parameters, clear, noise, setpoint, seen)
-    told = f"a swing of at least {swing:.2g} y each way, where the levels stop growing{ends}"
-    return told, Mark.OK
+    else:
+        seen, noise = np.array(samples.before()), rest.noise_std
+        clear = clear_swing(noise, parameters.band(noise), seen)
+        setpoint = rest.mean if math.isnan(parameters.setpoint) else parameters.setpoint
+        swing = sought_swing(parameters, clear, noise, setpoint, seen)
+        told = f"a swing of at least {swing:.2g} y each way, where the levels stop growing"
+        mend = "give wider limits"
+    beyond = [f"{end:g}" for end in (low, high) if abs(end - rest.mean) <= swing]
+    if beyond:
+        return f"{told}; it would end the tune at {' or '.join(beyond)} y: {mend}", Mark.NOTE
+    return told + ends, Mark.OK

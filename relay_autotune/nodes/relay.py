@@ -98,6 +98,7 @@ class RelayNode(ServedNode):
         self._waiting: dict[str, Session] = {}
         self._narrator = Narrator(self, self._words, self._tell)
         self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
+        require_settable(self, (), self._running)
         ask_before_changes(self, lambda given: require_settable(self, given, self._running))
         self._name = self.get_fully_qualified_name()
         self.get_logger().info(

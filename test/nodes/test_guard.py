@@ -249,6 +249,11 @@ def test_the_swing_is_told_before_the_tune_that_makes_it(limit: float) -> None:
     told, mark = _expected(given, samples, (1.0, replace(last, peak_max=2.0, peak_min=-2.0)))
     beyond = f"would end the tune at -{limit:g} or {limit:g} y"
     assert (mark, beyond in told) == ((Mark.NOTE, True) if limit < 2.0 else (Mark.OK, False))
+    # The swing that is clear of the noise itself reaches limits so close.
+    close = replace(asked, measurement_min=-0.1, measurement_max=0.1)
+    told, mark = _expected(close, samples, None)
+    assert mark is Mark.NOTE
+    assert told.endswith("it would end the tune at -0.1 or 0.1 y: give wider limits")
 
 
 def test_a_tune_is_asked_for_once_every_other_publisher_must_be_known() -> None:

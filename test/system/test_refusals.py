@@ -228,6 +228,11 @@ def test_a_dry_run_says_what_would_be_done_and_moves_nothing(idle: Rig) -> None:
         ("relay_node", {"amplitude": math.nan}, "amplitude is nan"),
         ("relay_node", {"amplitude": 1}, "amplitude is 1, expected a number with a decimal"),
         ("relay_node", {"min_cycles": 1}, "min_cycles is 1"),
+        (
+            "relay_node",
+            {"measurement_min": 5.0, "measurement_max": 1.0},
+            "measurement_min is 5, expected less than measurement_max, which is 1",
+        ),
         ("identifier_node", {"method": "guess"}, "method is 'guess', expected one of waveform"),
         ("plant_node", {}, "found neither"),
         ("relay_node", {"measurment_max": 50.0}, "did you mean measurement_max?"),
