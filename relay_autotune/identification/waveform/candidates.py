@@ -76,8 +76,6 @@ IMITATES_A_DRIFT = 10.0
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
 # zero of a slower inverse response as a drift.
 _LASTING = 2.0
-# A fit that was not brought to its end stops within a hundredth of its bound.
-_EARLY = 0.99
 # Least dry friction or play, as a share of the command's range: the steps of a sensor look like
 # a tenth.
 _LEAST_FRICTION = 0.01
@@ -394,14 +392,6 @@ class FitContext:
             state = multistart(problem, self.guess.turned(structure))
             found.append(None if state is None else self.candidate(problem, state))
         return [c for c in found if c is not None and c.model.process_sign * self.sign < 0]
-
-    def may_be_chosen(self, candidate: Candidate) -> bool:
-        """Return whether a candidate acts in the relay's direction, and not too late to be seen.
-
-        :param candidate: any; further terms may make an earlier one of it.
-        """
-        early = candidate.model.dead_time < _EARLY * candidate.problem.latest
-        return self.sign * candidate.model.process_sign >= 0 and early
 
     def refit(self, candidate: Candidate, colour: Colour | None) -> Candidate | None:
         """Fit a candidate in another colour, from where it is.

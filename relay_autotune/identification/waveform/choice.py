@@ -140,8 +140,7 @@ def chosen_fit(
     dense = problem.thinned(_MOST_WHITE)
     if found and dense.time.size > few.problem.time.size:
         found = _on_more_samples(replace(few, problem=dense), found)
-    found = [c for c in found if few.may_be_chosen(c) or sign * c.model.process_sign < 0]
-    own = [c for c in found if few.may_be_chosen(c)]
+    own = [c for c in found if sign * c.model.process_sign >= 0]
     if found and sign and not known.structure:
         turned = (few.refit(c, found[0].problem.colour) for c in few.turned())
         found = [*found, *(c for c in turned if c is not None)]
