@@ -38,10 +38,8 @@ _SAMPLES_A_SWING = 4.0
 # Shortest response of a process, in intervals between samples.
 _SHORTEST_RESPONSE = 0.5
 # A response is seen where the measurement leaves the mean of a rest by this many times the range
-# of the rest, by this many of its standard deviations, and by this share of the whole range.
-_RANGES, _DEVIATIONS, _SHARE = 3.0, 6.0, 0.03
-# Least number of samples of a rest, and shares of the time before the change that are looked at.
-_RESTING, _RESTS = 15, (1.0, 0.5, 0.25)
+# of the rest, and by this share of the whole range; least number of samples of a rest.
+_RANGES, _SHARE, _RESTING = 3.0, 0.03, 15
 # Longest dead time that is believed, over the time of the first response.
 _BELIEVED = 2.0
 
@@ -111,21 +109,15 @@ def latest_dead_time(time: FloatArray, y: FloatArray, u: Input, sign: int) -> fl
     change, k = float(u.times[inside[0]]), int(inside[0])
     direction = sign * np.sign(u.values[k] - (u.values[k - 1] if k else u.initial))
     first = int(np.searchsorted(time, change, side="right"))
-    length, whole = change - float(time[0]), float(np.ptp(y))
-    latest = math.inf
-    for share in _RESTS:
-        begin = int(np.searchsorted(time, change - share * length))
-        rest = y[begin:first]
-        if rest.size < _RESTING:
-            break
-        band = max(_RANGES * np.ptp(rest), _DEVIATIONS * rest.std(), _SHARE * whole)
-        outside = direction * (y[first:] - rest.mean()) > band
-        # A single sample may be a spike.
-        at = np.flatnonzero(outside[:-1] & outside[1:])
-        seen = float(time[first + at[0]]) - change if at.size else math.inf
-        if seen <= share * length:
-            latest = min(latest, _BELIEVED * seen)
-    return latest
+    rest = y[:first]
+    if rest.size < _RESTING:
+        return math.inf
+    band = max(_RANGES * float(np.ptp(rest)), _SHARE * float(np.ptp(y)))
+    outside = direction * (y[first:] - rest.mean()) > band
+    # A single sample may be a spike.
+    at = np.flatnonzero(outside[:-1] & outside[1:])
+    seen = float(time[first + at[0]]) - change if at.size else math.inf
+    return _BELIEVED * seen if seen <= change - float(time[0]) else math.inf
 
 
 _GRID_SAMPLES = 240
