@@ -19,6 +19,7 @@ from relay_autotune.errors import ModelError, ParameterError, TuningError
 from relay_autotune.experiment.early_end import FitProgress
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.cycles import is_switched
 from relay_autotune.record.record import Outcome, Record
 
 # Largest ratio of the responses of model and record, and largest difference of phase [rad].
@@ -32,8 +33,6 @@ _LEAST_LOOP, _LARGEST_LOOP = 1e-3, 10.0
 _LEAST_TIME, _LARGEST_TIME = 1e-3, 1e4
 # Largest number of poles: no structure that is fitted has more.
 _LARGEST_ORDER = 30
-# Largest number of levels of a relay's command; a controller whose set-point it moves has more.
-_LEVELS = 8
 
 
 @dataclass(frozen=True)
@@ -67,8 +66,7 @@ class ExperimentFacts:
         swing = float(np.ptp(record.measurement))
         sign, settings = 0, record.settings
         if settings is not None:
-            by_relay = np.unique(record.command).size <= _LEVELS
-            sign = -1 if settings.reverse_acting else 1 if by_relay else 0
+            sign = -1 if settings.reverse_acting else int(is_switched(record))
         found = cls(record.experiment_id, record.outcome, record.duration, sign=sign)
         if not (moved > 0.0 and swing > 0.0):
             return found

@@ -144,6 +144,19 @@ def _crossed_level(measurement: FloatArray, at: IntArray) -> float:
     return 0.5 * float(np.mean(before) + np.mean(reached))
 
 
+def is_switched(record: Record) -> bool:
+    """Return whether the commands of a record are those of a relay.
+
+    With a relay on the set-point, a controller answers with another command in each sample. They
+    are those of the last cycle, or of all samples where there is no cycle.
+
+    :param record: of a relay experiment.
+    """
+    starts = record.cycle_start
+    last = slice(*starts[-2:]) if len(starts) > 1 else slice(None)
+    return np.unique(record.command[last]).size < _MAX_LEVELS
+
+
 def find_relay(record: Record) -> RelayStretch | None:
     """Return the longest stretch in which the command switches between two levels.
 

@@ -29,6 +29,7 @@ from relay_autotune.identification.waveform.residuals import ljung_box, noise_to
 from relay_autotune.process.response import response
 from relay_autotune.process.simulation import simulate_relay
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.cycles import is_switched
 from relay_autotune.record.record import Cycle, PiecewiseConstant, Record, RelaySettings
 
 # The noise is known to 10 % from the 50 samples before a test, so that a residual of 1.3 times
@@ -213,10 +214,6 @@ def integrated_error(
     return float(np.sum(weights * integrand) * step / 3.0)
 
 
-# More different commands than these in a cycle are not those of a relay.
-_LEVELS = 6
-
-
 def assess(models: Sequence[Identification], record: Record) -> tuple[Identification, ...]:
     """Add to identified models how well each one agrees with the record.
 
@@ -299,10 +296,8 @@ def operating_point(record: Record) -> float:
 
 
 def _averaged(record: Record) -> Fold | None:
-    # With a relay on the set-point, a controller answers with other commands in each sample: the
-    # same relay on the model's command would make another oscillation.
-    *_, first, last = (0, 0, *record.cycle_start)
-    if np.unique(record.command[first:last]).size > _LEVELS:
+    if not is_switched(record):
+        # The same relay on the model's command would make another oscillation.
         return None
     try:
         return fold(record)
