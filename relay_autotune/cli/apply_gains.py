@@ -22,7 +22,15 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from relay_autotune.cli.arguments import DONE, NOTHING_FOUND, Parser, finite, guarded_in_graph, say
+from relay_autotune.cli.arguments import (
+    DONE,
+    NOTHING_FOUND,
+    Parser,
+    finite,
+    guarded_in_graph,
+    say,
+    step_height,
+)
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import (
     Working,
@@ -76,7 +84,7 @@ def _parser() -> Parser:
         help="name of the controller_node (%(default)s)",
     )  # fmt: skip
     parser.add_argument(
-        "--step", type=finite, default=0.0, metavar="Y", help="step of the set-point [y]"
+        "--step", type=step_height, default=0.0, metavar="Y", help="step of the set-point [y]"
     )
     parser.add_argument(
         "--load", type=finite, default=0.0, metavar="U",

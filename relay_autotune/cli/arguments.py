@@ -105,6 +105,14 @@ def finite(text: str) -> float:
     return value
 
 
+def step_height(text: str) -> float:
+    """Return the height of a step given on the command line."""
+    value = finite(text)
+    if value == 0.0:
+        raise argparse.ArgumentTypeError("expected a step up or down, found 0")
+    return value
+
+
 def say(program: str, text: str) -> None:
     """Write a message that is not a result to standard error: one line, broken on a terminal.
 

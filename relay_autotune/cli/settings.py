@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
-from relay_autotune.cli.arguments import finite, flag_of
+from relay_autotune.cli.arguments import finite, flag_of, step_height
 from relay_autotune.cli.terminal import BACK, UNITS, GoBack, asked, number_of, pair_of
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.laws import LAWS
@@ -56,6 +56,7 @@ class Setting(Quantity):
     :param question: how it is asked for; empty: nobody asks for it.
     :param example: what may be typed.
     :param parameters: of relay_node that it sets, for a range the lower and the upper one.
+    :param number: returns the number of the text behind its flag.
     """
 
     loops: tuple[Kind, ...] = (Kind.TOPICS,)
@@ -63,6 +64,7 @@ class Setting(Quantity):
     question: str = ""
     example: str = ""
     parameters: tuple[str, ...] = ()
+    number: Callable[[str], float] = finite
 
     @property
     def ends(self) -> int:
@@ -98,7 +100,7 @@ class Setting(Quantity):
         else:
             how["metavar"] = self.metavar or self.unit.upper()
             if self.is_number:
-                how["type"] = finite
+                how["type"] = self.number
         group.add_argument(flag_of(self), dest=self.name, help=self.description, **how)
 
     def values(self, given: Any) -> dict[str, Any]:
@@ -182,7 +184,7 @@ SETTINGS = (
         "prove the gains with a step of the set-point, by a controller_node of its own; without "
         "either flag it asks, with --yes it does not"
     ),
-    Setting("step", NOT_GIVEN, "y").means(
+    Setting("step", NOT_GIVEN, "y", number=step_height).means(
         "height of that step [y]; default: half of the swing of the tune, at least twenty times "
         "the noise (forty if that is within a third of the way to a limit), as far as --within "
         "and --command-within allow"

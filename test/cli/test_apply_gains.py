@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from relay_autotune.cli import apply_gains
+from relay_autotune.cli import apply_gains, tune_loop
 from relay_autotune.cli.apply_gains import Entries, found_entries, verified
 from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.table import beside
@@ -212,6 +212,15 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     assert "a step of the set-point by 2 y? The command goes to 2 u." in said
     assert "from -1.5 to 2 y" in told.err
     assert not asked and not answers
+
+
+@pytest.mark.parametrize("program", [apply_gains, tune_loop])
+def test_a_step_by_nothing_is_refused(program: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    """It made the step of the usual height."""
+    with pytest.raises(SystemExit) as ended:
+        program.main(["--step", "0"])
+    assert ended.value.code == 2
+    assert "argument --step: expected a step up or down, found 0;" in capsys.readouterr().err
 
 
 def test_without_a_record_of_a_tune_the_node_alone_refuses_a_step() -> None:
