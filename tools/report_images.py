@@ -75,7 +75,8 @@ def tune_as_the_demo() -> Analysis:
         seed=demo.SEED,
     )
     parameters = ExperimentParameters(amplitude=demo.AMPLITUDE, sample_period=demo.PERIOD)
-    experiment = RelayExperiment(parameters, demo.BASELINE)
+    # As relay_node does where nothing shows the ends of the actuator.
+    experiment = RelayExperiment(parameters, demo.BASELINE, from_small=True)
     k = 0
     while not experiment.finished:
         process.command(experiment.step(k * demo.PERIOD, process.measure(k * demo.PERIOD)))
