@@ -315,24 +315,31 @@ def add_web(
     group = parser.add_argument_group("a page in the browser")
     group.add_argument("--web", action="store_true", help=what)
     group.add_argument(
-        "--web-address", default=_LOOPBACK, metavar="HOST[:PORT]",
+        "--web-address", type=_address, default=_LOOPBACK, metavar="HOST[:PORT]",
         help="where it is served (%(default)s, any free port); other than on this machine's own "
         "address it asks for a token, which is part of the address that is printed",
     )  # fmt: skip
 
 
-def check_web(options: argparse.Namespace) -> None:
-    """Refuse a page that cannot be served, before any work is done.
+def _address(text: str) -> str:
+    # What reads an address takes a while to load.
+    if text != _LOOPBACK:
+        from relay_autotune.web.address import address_of
 
-    :param options: with those of :func:`add_web`.
-    :raises MissingPackageError: if the package that serves it is not installed.
-    :raises SelectionError: if its address is not valid.
+        try:
+            address_of(text)
+        except SelectionError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+    return text
+
+
+def check_web() -> None:
+    """Refuse a page where the package that serves it is not installed, before any work is done.
+
+    :raises MissingPackageError: if it is not.
     """
     if importlib.util.find_spec("tornado") is None:
         raise MissingPackageError(
             "--web needs the Python package tornado; install it with: pip install tornado, or "
             "apt install python3-tornado"
         )
-    from relay_autotune.web.address import address_of
-
-    address_of(options.web_address)

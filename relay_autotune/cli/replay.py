@@ -149,7 +149,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if options.report:
         check_output(options.report)
     if options.web:
-        check_web(options)
+        check_web()
     if options.output:
         return _into_file(jobs, options)
     status = DONE

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
-from relay_autotune.cli.arguments import finite, flag_of, step_height
+from relay_autotune.cli.arguments import finite, flag_of, given_quantities, step_height
 from relay_autotune.cli.terminal import BACK, UNITS, GoBack, asked, number_of, pair_of
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.laws import LAWS
@@ -70,6 +70,13 @@ class Setting(Quantity):
     def ends(self) -> int:
         """How many numbers it takes: two for a range."""
         return 2 if self.default == () else 1
+
+    def problem(self, value: Any) -> str | None:
+        """Return what is wrong with a value, or None if it is allowed."""
+        if self.ends > 1 and not value[0] < value[1]:
+            low, high = value
+            return f"{self.name} is {low:g} {high:g}, expected the lower number first"
+        return super().problem(value)
 
     @property
     def read(self) -> Callable[[str], Any]:
@@ -123,7 +130,7 @@ SETTINGS = (
     Setting("record_only", False, loops=_COMMAND).means(
         "tune without an identifier_node: a recording, and no model"
     ),
-    Setting("wait", 5.0, "s", loops=_COMMAND).means(
+    Setting("wait", 5.0, "s", 0.0, loops=_COMMAND).means(
         "how long to wait for the nodes [s] (%(default)s)"
     ),
     Setting("report", "", metavar="FILE", loops=_COMMAND).means(
@@ -131,7 +138,7 @@ SETTINGS = (
     ),
     Setting("json", False, loops=_COMMAND).means("print the result as JSON"),
     Setting(
-        "amplitude", 0.0, "u", example="0", parameters=("amplitude",), loops=_COMMAND,
+        "amplitude", 0.0, "u", 0.0, example="0", parameters=("amplitude",), loops=_COMMAND,
         question="half the distance of the relay's two commands; 0: found by the tune",
     ).means("half the distance of the two commands [u]; default: the node's parameter"),
     Setting("measurement", "", metavar="TOPIC", loops=_COMMANDING).means("topic that measures"),
@@ -149,11 +156,12 @@ SETTINGS = (
     ).means(
         "what stands in their other elements, such as '{data: [0.0, 1.5]}'"
     ),
-    Setting("command_period", NOT_GIVEN, "s", parameters=("command_period",)).means(
+    Setting("command_period", NOT_GIVEN, "s", 0.0, parameters=("command_period",)).means(
         "send the last command again after this time, for an actuator that stops without"
     ),
     Setting(
-        "measurement_timeout", NOT_GIVEN, "s", parameters=("measurement_timeout",), loops=_ALL,
+        "measurement_timeout", NOT_GIVEN, "s", 0.0, parameters=("measurement_timeout",),
+        loops=_ALL,
     ).means(
         "longest silence of the measurement; default: five of its intervals, and at least 1 s"
     ),
@@ -177,7 +185,7 @@ SETTINGS = (
         "design the gains for the law of another program, such as simple_pid, and prove them with "
         "that law"
     ),
-    Setting("sample_period", NOT_GIVEN, "s").means(
+    Setting("sample_period", NOT_GIVEN, "s", 0.0, open_ended=True).means(
         "time between two runs of that program [s]; default: that of the measurement"
     ),
     Setting("verify", False).means(
@@ -476,8 +484,9 @@ def kind_of(options: argparse.Namespace) -> Kind:
     """Return which kind of loop is to be tuned.
 
     :param options: with the flags of `add_settings`.
-    :raises SelectionError: if the flags do not go together.
+    :raises SelectionError: if the flags do not go together, or a value is out of its range.
     """
+    given_quantities(options, SETTINGS)
     kind = Kind.NODES
     lacking = [f"--{name}" for name in ("measurement", "command") if not getattr(options, name)]
     if options.controller or options.joint:

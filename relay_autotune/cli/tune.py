@@ -509,7 +509,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if rule not in RULES:
         raise SelectionError(f"unknown rule {rule!r}; known: {', '.join(RULES)}")
     if options.web:
-        check_web(options)
+        check_web()
     asked = design_options(options)
     if asked.law and not asked.sample_period:
         raise SelectionError(

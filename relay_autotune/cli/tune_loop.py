@@ -49,6 +49,7 @@ from relay_autotune.cli.terminal import (
     width,
 )
 from relay_autotune.cli.tune_view import Shown, check_lines
+from relay_autotune.errors import SelectionError
 from relay_autotune.exchange.export import EXPORTS
 from relay_autotune.nodes.shell import prefix, typed_for_parameter
 
@@ -65,54 +66,56 @@ def main(args: Sequence[str] | None = None) -> int:
     own, ros = _apart(given)
     parser = _parser()
     options = parser.parse_args(own)
-    _require_consistent(parser, options)
-    _require_no_parameter(parser, options, ros)
     options.typed = given
-    if (options.measurement and options.command) or options.joint:
+    try:
+        _require_consistent(options)
+        _require_no_parameter(options, ros)
+        kind = kind_of(options)
+    except SelectionError as error:
+        parser.refuse(str(error))
+    starts = kind is not Kind.NODES
+    if starts:
         # At once, since what follows takes a second to load.
         what = (options.joint or options.measurement, options.controller or options.command)
         told = f"looking at {what[0]} and {what[1]}; nothing is commanded yet"
         print(told, file=sys.stderr, flush=True)
-    starts = bool(options.measurement or options.joint)
     with Working("loading what talks to the nodes") if starts else nullcontext():
         import relay_autotune.nodes.tune_client  # noqa: F401  see run_command
 
     def work(graph: ExitStack) -> int:
         with ExitStack() as nodes:
-            return Session(parser, options, ros, graph, nodes).run()
+            return Session(parser, options, ros, kind, graph, nodes).run()
 
     return guarded_in_graph(PROGRAM, work)
 
 
-def _require_consistent(parser: Parser, options: argparse.Namespace) -> None:
-    """End the program if some options contradict each other."""
-    if options.amplitude < 0.0 or options.wait < 0.0:
-        parser.refuse("--amplitude and --wait are at least 0")
-    if options.sample_period is not None and options.sample_period <= 0.0:
-        parser.refuse(f"--sample-period is {options.sample_period:g}, expected more than 0 s")
+def _require_consistent(options: argparse.Namespace) -> None:
+    """Refuse options that contradict each other."""
     if options.web and (options.dry_run or options.json or options.report or options.export):
-        parser.refuse(
+        raise SelectionError(
             "--web has check, result, report and exports on its page: leave out --dry-run, "
             "--json, --report and --output"
         )
     if options.export in EXPORTS:
-        parser.refuse(
+        raise SelectionError(
             f"--export takes a file; give the program as --law {options.export}, and the file as "
             "--output FILE"
         )
     if options.step is not None and (
         options.verify is False or (options.yes and not options.verify)
     ):
-        parser.refuse("--step is that of the proof, which is not wanted here: give --verify, too")
+        raise SelectionError(
+            "--step is that of the proof, which is not wanted here: give --verify, too"
+        )
     if options.verify and (options.web or options.json or options.record_only or options.dry_run):
-        parser.refuse(
+        raise SelectionError(
             "--verify proves the gains of a tune that prints them: leave out --web, --json, "
             "--record-only and --dry-run"
         )
 
 
-def _require_no_parameter(parser: Parser, options: argparse.Namespace, ros: list[str]) -> None:
-    """End the program if a parameter is given that only relay_node has."""
+def _require_no_parameter(options: argparse.Namespace, ros: list[str]) -> None:
+    """Refuse a parameter that only relay_node has."""
     for flag, given in pairwise(ros):
         name, is_set, value = given.partition(":=")
         if flag not in ("-p", "--param") or not is_set or name == "use_sim_time":
@@ -122,7 +125,7 @@ def _require_no_parameter(parser: Parser, options: argparse.Namespace, ros: list
         do = f"give {FLAGS[name]} {value}" if name in FLAGS else "leave it out"
         if name not in FLAGS and not (options.measurement or options.joint):
             do = typed_for_parameter(node, name, value)
-        parser.refuse(f"{flag} {given} sets nothing in relay_node: {do}")
+        raise SelectionError(f"{flag} {given} sets nothing in relay_node: {do}")
 
 
 def _apart(given: list[str]) -> tuple[list[str], list[str]]:
@@ -153,6 +156,7 @@ class Session:
     :param parser: of the command line.
     :param options: that it has read; answers are kept there.
     :param ros: arguments for ROS.
+    :param kind: of the loop.
     :param graph: where the clients end.
     :param nodes: where the nodes of the command end, before the clients.
     :param signals: those that end it.
@@ -161,6 +165,7 @@ class Session:
     parser: argparse.ArgumentParser
     options: argparse.Namespace
     ros: list[str]
+    kind: Kind
     graph: ExitStack
     nodes: ExitStack
     signals: Signals = field(default_factory=Signals)
@@ -170,12 +175,11 @@ class Session:
         options, signals = self.options, self.signals
         signals.note(signal.SIGINT)
         self._check_files()
-        kind = kind_of(options)
-        if kind is not Kind.NODES or options.dry_run:
+        if self.kind is not Kind.NODES or options.dry_run:
             # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.
             signals.obey()
             signals.raise_if_came()
-        loops = self._looked_at(kind)
+        loops = self._looked_at()
         patience = max(map(self._find, loops))
         # A sensor that is slower than that needs a longer --wait.
         deadline = time.monotonic() + min(patience, max(options.wait, _READY_WITHIN))
@@ -209,9 +213,9 @@ class Session:
         if options.export:
             require_new(options.export)
         if options.web:
-            check_web(options)
+            check_web()
 
-    def _looked_at(self, kind: Kind) -> list[Loop]:
+    def _looked_at(self) -> list[Loop]:
         """Look at the loops, and ask for what is not given."""
         from relay_autotune.cli.loops import Loop, TopicLoop
         from relay_autotune.nodes.loop_client import LoopClient
@@ -225,9 +229,9 @@ class Session:
 
         # The nodes of this process alone have a namespace of their own.
         own = options.namespace or f"tune_loop_{os.getpid()}"
-        if kind is Kind.TOPICS:
+        if self.kind is Kind.TOPICS:
             return [TopicLoop(client(own), options)]
-        if kind in (Kind.JOINT, Kind.OPENED):
+        if self.kind is not Kind.NODES:
             from relay_autotune.cli.joint_tune import JointLoop
 
             with Working("joining the ROS graph"):

@@ -475,6 +475,30 @@ def test_a_step_without_a_proof_is_refused(
     assert "give --verify, too" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("--within 50 30", "--within is 50 30, expected the lower number first"),
+        ("--command-within 5 5", "--command-within is 5 5, expected the lower number first"),
+        ("--command-period -1", "--command-period is -1, expected at least 0 s"),
+        ("--measurement-timeout -1", "--measurement-timeout is -1, expected at least 0 s"),
+        ("--sample-period 0", "--sample-period is 0, expected above 0 s"),
+        ("--amplitude -1", "--amplitude is -1, expected at least 0 u"),
+        ("--wait -1", "--wait is -1, expected at least 0 s"),
+        ("--web-address [::1]:99999", "argument --web-address: '[::1]:99999' is not an address"),
+    ],
+)
+def test_a_number_out_of_its_range_is_refused_before_anything_is_loaded(
+    words: str, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The node refused a period after its start; limits in the wrong order had no flag."""
+    with pytest.raises(SystemExit) as ended:
+        tune_loop.main(["--measurement", "/y", "--command", "/u", *words.split()])
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"tune_loop: {told}") and said.count("\n") == 1
+
+
 def test_a_question_shows_what_is_now_and_refuses_what_cannot_be(
     typed: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
