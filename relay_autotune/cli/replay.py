@@ -45,6 +45,7 @@ from relay_autotune.cli.terminal import Working, require_new, width, write
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.gains import FORMS
 from relay_autotune.result import Analysis
+from relay_autotune.text import counted
 
 if TYPE_CHECKING:
     from relay_autotune.report.case import Case
@@ -250,7 +251,7 @@ def _into_file(jobs: Sequence[Job], options: argparse.Namespace) -> int:
         if len(left) < len(jobs):
             say(PROGRAM, f"{len(jobs) - len(left)} of {len(jobs)} bags are in {results.path}")
         failed = 0
-        with Working(f"working on {len(left)} bags", patient=True) as working:
+        with Working(f"working on {counted(len(left), 'bag')}", patient=True) as working:
             for count, (_, done) in enumerate(_as_they_come(left, options), start=1):
                 working.clear()
                 _tell(done)
@@ -259,7 +260,7 @@ def _into_file(jobs: Sequence[Job], options: argparse.Namespace) -> int:
                 status = worst(status, done.status)
                 working.share(count, len(left))
     of_these = f", {failed} of them without a model" if failed else ""
-    say(PROGRAM, f"{len(left)} bags done{of_these}; results in {options.output}")
+    say(PROGRAM, f"{counted(len(left), 'bag')} done{of_these}; results in {options.output}")
     return status
 
 

@@ -228,7 +228,7 @@ def cautions(
         if value > _HELD * asked:
             found.append(
                 f"{name} is {value:.3g}, above the {asked:g} asked for; choose another rule, or "
-                f"allow more by {name.lower()}"
+                f"a larger --{name.lower()}"
             )
     noise = performance.noise_gain * options.noise_std
     known = options.sample_period > 0.0 and options.amplitude > 0.0

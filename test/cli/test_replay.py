@@ -470,6 +470,7 @@ def test_bad_recordings_end_with_one_line_and_status_1(tmp_path, capsys, name):
         (["--method", "guess"], "unknown method 'guess'; known: waveform"),
         (["--rule", "thumb"], "unknown rule 'thumb'; known: robust"),
         (["--start", "5", "--end", "5"], "--start 5 is not before --end 5"),
+        (["--command-min", "5", "--command-max", "1"], "--command-min 5 is not below --command"),
         (["--start", "1e9"], "no sample lies between"),
         (["--time", "t"], "--time, --time-unit and --period are for CSV files"),
     ],

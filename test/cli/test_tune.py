@@ -244,7 +244,7 @@ def test_exports(capsys, tmp_path):
     status, out, err = run(capsys, FOPDT, asked, "yaml --output", path)
     assert (status, out) == (0, "")
     # What the user must know stands in the file and beside it.
-    assert err.startswith("tune: Ms is 1.95, above the 1.4 asked for")
+    assert err.startswith("tune: Ms is 1.95, above the 1.4 asked for; choose another rule, or a ")
     assert f"# {err.removeprefix('tune: ')}" in Path(path).read_text()
     status, _, err = run(capsys, FOPDT, asked, "yaml --output", path)
     assert status == 2
@@ -259,6 +259,7 @@ REFUSED = [
     ("--gain 1 --time-constants 0", 2, "time constant must be > 0 s, found 0"),
     ("--structure fopdt --gain 1 --time-constants -20", 2, "must be > 0 s, found -20"),
     ("--gain 1 --time-constants 1 --dead-time -1", 2, "dead time must be >= 0 s, found -1"),
+    ("--gain 1 --command-min 5 --command-max 5", 2, "--command-min 5 is not below --command-max"),
     ("--gain 1", 2, "no dynamics"),
     ("--time-constants 1", 2, "lacks its gain"),
     ("--gain 1 --time-constants 1 2 --order 3", 2, "--order 3"),
