@@ -234,16 +234,27 @@ class Loop:
                     f"says how the tune ended"
                 )
 
+    @property
+    def safe_command(self) -> str:
+        """The safe command in words."""
+        return "the safe command"
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether the last tune ended since its sensor told nothing any more."""
+        return self.client.result.why.code in (Code.SILENT_SENSOR, Code.SENSOR_GONE)
+
     def left(self) -> str:
         """Return in which state a tune without gains has left the plant; empty: not known."""
+        sent = f"{self.safe_command} was sent"
         if others := self.other_commander():
-            return f"the safe command was sent, but {others} commands, too, and goes on"
-        if self.client.result.why.code in (Code.SILENT_SENSOR, Code.SENSOR_GONE):
-            return "the safe command was sent, and no measurement shows whether the plant has it"
+            return f"{sent}, but {others} commands, too, and goes on"
+        if self.is_silent:
+            return f"{sent}, and no measurement shows whether the plant has it"
         if self.has_own_nodes:
             return ""
         controllers = self.client.others_on("controller_command")
-        return f"the safe command was sent, and {controllers} commands again" * bool(controllers)
+        return f"{sent}, and {controllers} commands again" * bool(controllers)
 
     def other_commander(self) -> str:
         """Return who else commanded during a tune that ended for that; empty: nobody."""
@@ -256,7 +267,7 @@ class Loop:
 
         :param command: that tunes it in the same way.
         """
-        return [("run it again", command)]
+        return [("once it measures and rests" if self.is_silent else "run it again", command)]
 
     def present(self) -> Controller | None:
         """Return the gains in force in its controller; None: they are not known."""
@@ -422,13 +433,18 @@ class TopicLoop(Loop):
             nodes["identifier_node"] = ros_arguments(space, values=given)
         return nodes
 
+    @property
+    def safe_command(self) -> str:
+        """The safe command in words."""
+        return f"the safe command {self.options.at:.6g} u"
+
     def left(self) -> str:
         """Return at which command the loop is left, and whether that is the right one."""
         command, topic = self.options.at, self.options.command
         if not self.client.is_taken(topic):
             return (
-                f"the safe command {command:.6g} u was sent, but nobody takes commands from "
-                f"{topic} any more: see to the plant"
+                f"{self.safe_command} was sent, but nobody takes commands from {topic} any more: "
+                f"see to the plant"
             )
         if told := super().left():
             return told
@@ -437,7 +453,7 @@ class TopicLoop(Loop):
                 f"the command stands at {command:.6g} u, which is not the one at which the "
                 f"process rested: set the right one now"
             )
-        told = f"the plant is left at the safe command {command:.6g} u"
+        told = f"the plant is left at {self.safe_command}"
         if self.left_its_limits:
             told += ": look whether the process rests there, else set the right one now"
         return told

@@ -832,7 +832,8 @@ def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
 
     silent = ended(Code.SILENT_SENSOR(topic="/tank/level", silence=1.01))
     (what, command), (then, told) = repeated(silent, None)
-    assert (what, command, then) == ("run it again", again, "if it happens again")
+    once = "once it measures and rests"
+    assert (what, command, then) == (once, again, "if it happens again")
     # What can be typed on a machine without the ros2 command, too.
     assert "the sensor of /tank/level (--dry-run tells its rate)" in told
     assert told.endswith("for a longer silence give --measurement-timeout")
@@ -1101,6 +1102,13 @@ def test_a_launch_file_starts_the_controller_with_limits_and_topics() -> None:
             "once it rests",
         ),
         (core.Reason(Code.NODE_FAILED), False, "the plant is left at", "report it"),
+        # The plant may still stand where the relay had it.
+        (
+            core.Reason(Code.SENSOR_GONE),
+            False,
+            "1040 u was sent, and no",
+            "once it measures and rests",
+        ),
         (
             core.Reason(Code.CANCELLED),
             False,
@@ -1128,7 +1136,7 @@ def test_after_an_end_that_would_come_again_the_same_command_is_not_offered_agai
     assert left_at in loop.left()
     ((name, told),) = AfterTune(loop, parser).repeated(None)
     assert name == next_step
-    assert ("1040" in told) == (next_step == "run it again")
+    assert ("1040" in told) == (next_step in ("run it again", "once it measures and rests"))
 
 
 def test_after_a_tune_beside_another_program_its_command_is_not_said_to_be_the_last() -> None:
@@ -1142,7 +1150,7 @@ def test_after_a_tune_beside_another_program_its_command_is_not_said_to_be_the_l
         others_on=lambda topic: "/pid", is_taken=lambda topic: True,
     )  # fmt: skip
     loop = topic_loop(client, given)
-    assert loop.left() == "the safe command was sent, but /pid commands, too, and goes on"
+    assert loop.left() == "the safe command 40 u was sent, but /pid commands, too, and goes on"
     first, again = AfterTune(loop, parser).repeated(None)
     assert first == ("first", "end /pid, which commands /u") and again[0] == "run it again"
     assert Loop(client, given).left().startswith("the safe command was sent, but a node not known")
@@ -1162,7 +1170,7 @@ def test_a_plant_that_has_gone_is_not_said_to_be_left_at_the_safe_command() -> N
     )
     # One that was killed is known for some 20 s.
     client.is_taken = lambda topic: True
-    told = "the safe command was sent, and no measurement shows whether the plant has it"
+    told = "the safe command 40 u was sent, and no measurement shows whether the plant has it"
     assert loop.left() == told
 
 
