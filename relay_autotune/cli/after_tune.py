@@ -151,11 +151,10 @@ class AfterTune(Tuned):
             return [
                 ("report it", "this is a defect: send its reason, and the recording if you can")
             ]
-        words = options.typed
+        again = shlex.join([PROGRAM, *options.typed])
         if loop.proves:
-            words = shlex.split(as_typed(PROGRAM, self.parser, options, verify=None))[1:]
-        again = prefix() + shlex.join([PROGRAM, *words])
-        steps = loop.again(again)
+            again = as_typed(PROGRAM, self.parser, options, verify=None)
+        steps = loop.again(prefix() + again)
         if result.why.code == Code.SILENT_SENSOR:
             why = reason_from_message(result.why)
             told = f"the sensor of {why['topic']} (--dry-run tells its rate) and the load (uptime)"

@@ -17,7 +17,6 @@ command line is wrong.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
@@ -65,8 +64,7 @@ _FOUND_WITHIN = 5.0
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
-    given = list(sys.argv[1:] if args is None else args)
-    options = _parser().parse_args(given)
+    options = _parser().parse_args(args)
     import relay_autotune.nodes.gains_client  # noqa: F401  see run_command
 
     return guarded_in_graph(PROGRAM, lambda graph: _work(options, graph))

@@ -243,20 +243,12 @@ class Chart:
     identify: Callable[..., Identification]
 
     @cached_property
-    def _numbers(self) -> dict[str, inspect.Parameter]:
+    def takes(self) -> dict[str, bool]:
+        """The names of the numbers that it can use, and whether it needs each."""
         found = inspect.signature(self.identify).parameters
-        return {name: each for name, each in found.items() if name != "known"}
-
-    @property
-    def takes(self) -> tuple[str, ...]:
-        """Names of the numbers that it can use, first those that it needs."""
-        return tuple(self._numbers)
-
-    @property
-    def required(self) -> tuple[str, ...]:
-        """Names of the numbers that it needs."""
-        found = self._numbers.items()
-        return tuple(name for name, each in found if each.default is inspect.Parameter.empty)
+        return {
+            name: each.default is each.empty for name, each in found.items() if name != "known"
+        }
 
     @property
     def takes_structure(self) -> bool:
@@ -304,7 +296,7 @@ def identify_chart(method: str, numbers: Mapping[str, float], known: Known) -> I
     :raises IdentificationError: if no model has these numbers.
     """
     chart = look_up(CHART_METHODS, method, "method", SelectionError)
-    if lacking := [_FLAGS[n] for n in chart.required if n not in numbers]:
+    if lacking := [_FLAGS[n] for n, needed in chart.takes.items() if needed and n not in numbers]:
         raise SelectionError(f"{method} also needs {', '.join(lacking)}")
     if unused := [_FLAGS[n] for n in numbers if n not in chart.takes]:
         takes = ", ".join(_FLAGS[n] for n in chart.takes)
@@ -329,8 +321,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> Parser:
     methods: list[str] = []
     for name, chart in CHART_METHODS.items():
-        needed = chart.required
-        numbers = [_FLAGS[n] if n in needed else f"[{_FLAGS[n]}]" for n in chart.takes]
+        numbers = [_FLAGS[n] if needed else f"[{_FLAGS[n]}]" for n, needed in chart.takes.items()]
         methods += labelled(name, chart.summary, width(), indent=17)
         methods += labelled("", "   ".join(numbers), width(), indent=17)
     parser = Parser(

@@ -309,15 +309,16 @@ def _identification(found: Identification) -> list[_Entry]:
     ):
         if math.isfinite(value):
             numbers.append((label, digits(value), unit, plus_minus(value, NORMAL_95 * std)))
-    lines = [*_process("process", found.model, name), *_below_one_another(numbers)]
+    lines = [("process", _process(found.model, name)), *_below_one_another(numbers)]
     lines += _known_all_the_same(found)
     lines.append(("fit", _fit(found)))
     if found.validation is not None:
         lines.append(("limit cycle", _validation(found.validation)))
-    for i, rival in enumerate(found.rivals[:_RIVALS]):
-        share = f"{percent(rival.support)} % of the support"
-        note = f"{rival.model.structure}, {share}"
-        lines += _process("rivals" if i == 0 else "", rival.model, note)
+    rivals = [
+        _process(each.model, f"{each.model.structure}, {percent(each.support)} % of the support")
+        for each in found.rivals[:_RIVALS]
+    ]
+    lines += _listed("rivals", rivals)
     if found.why_chosen:
         lines.append(("", found.why_chosen))
     for warning in found.warnings:
@@ -342,16 +343,16 @@ def _known_all_the_same(found: Identification) -> list[_Entry]:
 def _others(analysis: Analysis) -> list[_Entry]:
     """Return what the other methods found, a line for each."""
     others = [model for i, model in enumerate(analysis.models) if i != analysis.selected]
-    lines, instead = [], ""
+    texts, instead = [], ""
     chosen = None if analysis.model is None else analysis.model.validation
     if chosen is not None and not chosen.reason:
         instead = f" instead of {digits(100.0 * chosen.worst, 2)} %"
-    for i, m in enumerate(others):
+    for m in others:
         note = f"{m.structure}, {m.method}"
         if m.validation is not None and not m.validation.reason:
             note += f", limit cycle {digits(100.0 * m.validation.worst, 2)} % off{instead}"
-        lines += _process("also" if i == 0 else "", m.model, note)
-    return lines
+        texts.append(_process(m.model, note))
+    return _listed("also", texts)
 
 
 def _fit(found: Identification) -> str:
@@ -393,14 +394,12 @@ def _validation(validation: Validation) -> str:
 def _other_gains(analysis: Analysis) -> list[_Entry]:
     """Return what the other rules say, a line for each."""
     others = [gains for i, gains in enumerate(analysis.gains) if i != analysis.recommended]
-    return [
-        (
-            "also" if i == 0 else "",
-            f"kc {digits(g.kc)} u/y   ti {digits(g.ti)} s   td {digits(g.td)} s   "
-            f"Ms {digits(g.ms, 3)}   ({g.rule})",
-        )
-        for i, g in enumerate(others)
+    texts = [
+        f"kc {digits(g.kc)} u/y   ti {digits(g.ti)} s   td {digits(g.td)} s   "
+        f"Ms {digits(g.ms, 3)}   ({g.rule})"
+        for g in others
     ]
+    return _listed("also", texts)
 
 
 def _gains(gains: Gains, verdict: Verdict, series: Sequence[str]) -> list[_Entry]:
@@ -464,6 +463,11 @@ def _below_one_another(numbers: Sequence[tuple[str, str, str, str]]) -> list[_En
     ]
 
 
-def _process(label: str, model: TransferFunction, note: str) -> list[_Entry]:
+def _process(model: TransferFunction, note: str) -> str:
     """Return a transfer function with a note, on one line where it fits."""
-    return [(label, f"{process_text(model)}   ({note})")]
+    return f"{process_text(model)}   ({note})"
+
+
+def _listed(label: str, texts: Sequence[str]) -> list[_Entry]:
+    """Return texts below one another, the first of them with the label."""
+    return [(label if i == 0 else "", text) for i, text in enumerate(texts)]

@@ -257,7 +257,7 @@ def _coefficients(name: str, values: Any) -> list[float]:
     return [_number(name, value) for value in values]
 
 
-_HEADINGS = ("kc", "ti", "td", "Ms", "Mt", "GM", "PM", "IAE")
+_HEADINGS = ("Ms", "Mt", "GM", "PM", "IAE")
 # The numbers of gains in each form, with their units.
 _ISA = {"kc": "u/y", "ti": "s", "td": "s"}
 _NUMBERS = {"isa": _ISA, "series": _ISA, "parallel": {"p": "u/y", "i": "u/(y s)", "d": "u s/y"}}
@@ -321,7 +321,7 @@ class _Designs:
         """Return a line for each rule and each controller with a model inside, and why not."""
         rows: list[tuple[str, ...]] = []
         if self.gains:
-            rows.append(("", *_NUMBERS[self.form], *_HEADINGS[3:]))
+            rows.append(("", *_NUMBERS[self.form], *_HEADINGS))
             for k, each in enumerate(self.gains):
                 mark = "* " if k == self.recommended else "  "
                 bare = each.bare if self.form == "parallel" else None
@@ -330,7 +330,7 @@ class _Designs:
         if self.inside:
             rows.append(("",) * 9)
             rows.append(("with a model inside", *("",) * 8))
-            rows.append(("", "lambda", "DM", "", *_HEADINGS[3:]))
+            rows.append(("", "lambda", "DM", "", *_HEADINGS))
             for compensator, found in self.inside:
                 numbers = digits(compensator.closed_loop_time), digits(found.delay_margin, 3), ""
                 rows.append((f"  {compensator.name}", *numbers, *_judged(found)))

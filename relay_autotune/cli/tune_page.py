@@ -29,14 +29,7 @@ from relay_autotune.cli.own_nodes import PROGRAM
 from relay_autotune.cli.report import flags_of
 from relay_autotune.cli.settings import NAMES
 from relay_autotune.cli.terminal import UNITS
-from relay_autotune.cli.tune_view import (
-    STATES,
-    Paint,
-    Shown,
-    check_parts,
-    estimate,
-    oscillation,
-)
+from relay_autotune.cli.tune_view import STATES, Paint, Shown, check_parts, told_of
 from relay_autotune.cli.tuned import Tuned
 from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError
 from relay_autotune.exchange.messages import (
@@ -294,8 +287,8 @@ class _LoopOnPage:
             "remaining": feedback.remaining,
         }
         if feedback.cycle > len(told.cycles):
-            words = (f"cycle {feedback.cycle}", oscillation(feedback), estimate(feedback))
-            changed["cycles"] = (*told.cycles, ", ".join(filter(None, words)))
+            line = told_of(f"cycle {feedback.cycle}", feedback)
+            changed["cycles"] = (*told.cycles, line)
         if feedback.transfer_function.experiment_id:
             changed["process"] = self._show(feedback.transfer_function, feedback.cycle)
         self._live.tell(**changed)

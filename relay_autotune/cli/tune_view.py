@@ -101,6 +101,15 @@ def oscillation(feedback: Any) -> str:
     return text
 
 
+def told_of(begins: str, feedback: Any) -> str:
+    """Return the last whole cycle and what is known after it, as far as they are there.
+
+    :param begins: the first words.
+    :param feedback: a `Tune.Feedback`.
+    """
+    return ", ".join(filter(None, (begins, oscillation(feedback), estimate(feedback))))
+
+
 def log_line(feedback: Any, before: Any = None) -> str:
     """Return a feedback as one plain line, for a log.
 
@@ -110,12 +119,11 @@ def log_line(feedback: Any, before: Any = None) -> str:
     state = STATES[feedback.state]
     told = feedback.status or state
     if state == "completed" and (before is None or before.state != feedback.state):
-        told = ", ".join(filter(None, (state, oscillation(feedback), estimate(feedback))))
+        told = told_of(state, feedback)
     elif feedback.cycle and (before is None or before.cycle != feedback.cycle):
-        parts = [f"cycle {feedback.cycle}", oscillation(feedback), estimate(feedback)]
+        told = told_of(f"cycle {feedback.cycle}", feedback)
         if math.isfinite(feedback.remaining) and feedback.remaining > 0.0:
-            parts.append(f"about {duration(feedback.remaining)} left")
-        told = ", ".join(filter(None, parts))
+            told += f", about {duration(feedback.remaining)} left"
     return f"{feedback.elapsed:8.1f} s  {told}"
 
 
