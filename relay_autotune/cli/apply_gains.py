@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any
 
 from relay_autotune.cli.arguments import (
@@ -251,7 +251,9 @@ def verified(
     try:
         now = _numbers(client.in_force())
         if result.passed and stays:
-            now += f"; {PROGRAM} --revert takes those before"
+            with suppress(LoopError):
+                client.ask("before")
+                now += f"; {PROGRAM} --revert takes those before"
         if not result.passed and new is not None and client.has(new):
             now += "; these are the new ones, which are not proven: set those before yourself"
     except LoopError as error:

@@ -12,6 +12,7 @@ import math
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -453,7 +454,10 @@ class ControllerNode(ServedNode):
         # Newer gains may have arrived meanwhile.
         if self._pending is offered:
             self._pending = None
-        return f"gains of {name}: {done}; ~/revert brings back those before"
+        with suppress(TuningError):
+            self._keeper.before()
+            done += "; ~/revert brings back those before"
+        return f"gains of {name}: {done}"
 
     def _discard(self, _: Trigger.Request) -> str:
         waiting, self._pending, self._refused = self._pending, None, ""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -50,9 +51,16 @@ MESSAGE = PidGains()
 fill_gains(MESSAGE, GAINS, experiment_id="x")
 
 
-def verdict_entries(result: Any, present: Controller | None) -> Entries:
+def nothing_before(service: str) -> str:
+    """Answer as a node that has no gains to go back to."""
+    raise LoopError(f"~/{service} refuses: there are no gains before these to go back to")
+
+
+def verdict_entries(
+    result: Any, present: Controller | None, ask: Callable[[str], str] = nothing_before
+) -> Entries:
     """Return what is told of a verification, after which gains are in force."""
-    client: Any = SimpleNamespace(in_force=lambda: present, prove=lambda *words: result)
+    client: Any = SimpleNamespace(in_force=lambda: present, prove=lambda *words: result, ask=ask)
     return verified(client, 0.5, print, lambda: False, None)[1]
 
 
@@ -115,14 +123,18 @@ def test_a_slip_in_the_present_gains_is_asked_about(typed: Controller, meant: st
 def test_a_verdict_has_five_lines() -> None:
     load = step(kind=Verification.LOAD, step=0.3, gain_ratio=1.01)
     result = Verify.Result(passed=True, reason="long numbers", steps=[step(), load])
-    lines = laid_out(verdict_entries(result, Controller(0.6, 0.75, 0.2, 0.02)), 120)
-    assert len(lines) == 5
+    asked: list[str] = []
+    present = Controller(0.6, 0.75, 0.2, 0.02)
+    lines = laid_out(verdict_entries(result, present, lambda s: asked.append(s) or "kc 0.3"), 120)
+    assert (len(lines), asked) == (5, ["before"])
     assert "passed: the loop does what the model predicts" in lines[0]
     told = "overshoot 10 % (predicted 11 %), settled within 5 % after 3.8 s (predicted 4.2 s)"
     assert f"+0.5 y: {told}" in lines[1]
     assert "+0.3 u" in lines[2]
     assert "gain 0.96 and 1.01 times the model's, Ms 1.37 and 1.37 (predicted 1.39)" in lines[3]
     assert "kc 0.6000, ti 0.7500, td 0.2000; apply_gains --revert" in lines[4]
+    # the way back is named only where there is one
+    assert laid_out(verdict_entries(result, present), 120)[4].endswith("td 0.2000")
 
 
 def test_in_noise_a_proof_says_how_far_it_moves_the_overshoot_and_widens_the_band() -> None:

@@ -29,7 +29,7 @@ def test_revert_leads_to_the_last_whole_set_or_is_refused(rig: Rig) -> None:
     assert loop.trigger("before").message == "kc 0.3, ti 1 s, td 0 s"
     assert loop.trigger("revert").success
     assert loop.gains_shown() == (0.3, 1.0)
-    loop.apply(*GOOD, "one")
+    assert "~/revert brings back those before" in loop.apply(*GOOD, "one").message
     assert loop.trigger("revert").success
     assert loop.gains_shown() == (0.3, 1.0)
     assert not loop.trigger("revert").success
@@ -39,7 +39,7 @@ def test_failed_gains_stay_nowhere_and_never_come_back(rig: Rig) -> None:
     """Their model has a third of the gain of the process."""
     loop = HandLoop(rig)
     assert loop.gains_shown()[0] == 0.0
-    loop.apply(*WILD, "wild", gain=0.7)
+    assert "revert" not in loop.apply(*WILD, "wild", gain=0.7).message
     result = loop.verify(setpoint_step=0.3)
     assert not result.passed
     # The first gains ever: there are no earlier ones.
