@@ -41,7 +41,7 @@ from relay_autotune.cli.terminal import (
     write,
 )
 from relay_autotune.errors import LoopError, TuningError
-from relay_autotune.exchange.messages import reason_from_message
+from relay_autotune.exchange.messages import gains_from_message, reason_from_message
 from relay_autotune.reasons import Code
 from relay_autotune.text import digits, duration
 
@@ -157,7 +157,8 @@ def _write(client: GainsClient, options: argparse.Namespace) -> int:
     from relay_autotune.exchange.export import Target, exported
     from relay_autotune.loop.laws import LAWS, OWN_LAW
 
-    gains, doubt = client.waiting()
+    message, doubt = client.newest()
+    gains = gains_from_message(message)
     _require_trust(doubt, options)
     how = gains.law or OWN_LAW
     write(exported(gains, how, Target(), doubt=doubt), options.file)
@@ -182,7 +183,8 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
     """
     with Working("asking for the gains"):
         present, (model, _) = client.in_force(), client.identified()
-        gains, doubt = client.waiting()
+        message, doubt = client.newest()
+    gains = gains_from_message(message)
     if not options.verify_only:
         _require_trust(doubt, options)
         if client.has(gains):
@@ -208,11 +210,11 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
     accepting = client.allowing(accept_doubtful=options.accept_doubtful)
     if options.no_verify:
         with accepting:
-            client.ask("apply")
+            client.put_in_force(message)
         if options.stays:
             tell("gains", f"in force, not verified; {PROGRAM} --verify-only makes the step")
         return True, ""
-    new = None if options.verify_only else gains
+    new = None if options.verify_only else message
     with accepting, noted(lambda text: say(PROGRAM, text)) as (shown, leave):
         result, entries = verified(
             client, step, shown, leave, new,
@@ -229,7 +231,7 @@ def verified(
     step: float,
     tell: Callable[[str], None],
     leave: Callable[[], bool],
-    new: Controller | None,
+    new: Any,
     *,
     load: float = 0.0,
     patience: float = REST_WITHIN,
@@ -241,7 +243,7 @@ def verified(
     :param step: of the set-point [y].
     :param tell: called with what is waited for.
     :param leave: returns True to end the verification.
-    :param new: the gains that wait, to be put in force; None: those in force are tried.
+    :param new: the `PidGains` to be put in force; None: those in force are tried.
     :param load: a second step, of the load [u]; 0: none.
     :param patience: how long to wait until the loop is at rest [s].
     :param stays: True if the controller_node goes on running.
@@ -254,7 +256,7 @@ def verified(
             with suppress(LoopError):
                 client.ask("before")
                 now += f"; {PROGRAM} --revert takes those before"
-        if not result.passed and new is not None and client.has(new):
+        if not result.passed and new is not None and client.has(gains_from_message(new)):
             now += "; these are the new ones, which are not proven: set those before yourself"
     except LoopError as error:
         now = f"not known: {error}; before the proof: {_numbers(before)}"

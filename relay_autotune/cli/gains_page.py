@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -223,14 +222,11 @@ class GainsPage:
                 subject.case = replace(subject.case, proof=entries)
         else:
             controller = self._found()
-            with (
-                controller.allowing(accept_doubtful=wish.doubtful),
-                controller.offered(message) if message else nullcontext() as new,
-            ):
+            with controller.allowing(accept_doubtful=wish.doubtful):
                 self._begin_step("")
                 # The page has a button that takes them back.
                 result, entries = verified(
-                    controller, step, self._say, self.leave, new, stays=False
+                    controller, step, self._say, self.leave, message, stays=False
                 )
                 self._show_steps(controller.steps_of(result))
         live.rest(

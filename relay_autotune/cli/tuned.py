@@ -262,11 +262,10 @@ class Proof:
         with self._started(doubtful) as controller:
             tell(f"starting {CONTROLLER}")
             controller.find(START_WITHIN, leave)
-            with controller.offered(self._message) as gains:
-                found = controller.prove(step, 0.0, patience, tell, leave, gains)
-                if found.passed:
-                    # Without gains it would hold its command, wherever that is.
-                    controller.let_settle(self._choice.settles, tell, "the loop goes back", leave)
+            found = controller.prove(step, 0.0, patience, tell, leave, self._message)
+            if found.passed:
+                # Without gains it would hold its command, wherever that is.
+                controller.let_settle(self._choice.settles, tell, "the loop goes back", leave)
             show(controller.steps_of(found))
         which = f"{gains_words(self._gains)}, at {time.strftime('%H:%M')}"
         return found, (("gains", which), *found_entries(found))

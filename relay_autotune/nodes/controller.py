@@ -123,15 +123,15 @@ class ControllerNode(ServedNode):
         self._settings = tables.settings_from(values, self._rate)
         gains = self._settings.gains
         self._results = ResultCheck(self, lambda c, m: is_stable(self._place.control(c).law, m))
-        # The gains that wait to be applied, with the id of their experiment.
-        self._pending: tuple[str, Gains] | None = None
+        # The newest gains, with the id of their experiment; after a revert they may be applied
+        # again.
+        self._newest: tuple[str, Gains] | None = None
         # Why those that came since were refused; empty: none were.
         self._refused = ""
-        # Why the waiting gains are doubtful; empty: they are trusted.
+        # Why the newest gains are doubtful; empty: they are trusted.
         self._doubt = ""
-        self._applying = False
-        # The last that were applied or tried.
-        self._offered: tuple[str, Gains] | None = None
+        # The last that were applied or tried, which auto_apply leaves.
+        self._tried: tuple[str, Gains] | None = None
         self._predictors = Predictors(self._results.models)
         self._pid = running(
             self._rate,
@@ -373,7 +373,7 @@ class ControllerNode(ServedNode):
         if gains is None:
             self._refused = self._results.refusals.last
             return
-        self._pending, self._refused = (name, gains), ""
+        self._newest, self._refused = (name, gains), ""
         self._doubt = why_doubtful(message)
         if self._doubt:
             self.get_logger().warning(f"gains of {name} are {self._doubt}")
@@ -400,16 +400,18 @@ class ControllerNode(ServedNode):
 
     def _apply_by_itself(self) -> None:
         """Apply gains if auto_apply is set and record and model of their experiment are here."""
-        if self._pending is None or self._doubt or not self.get_parameter("auto_apply").value:
+        if self._newest is None or self._newest is self._tried or self._doubt:
             return
-        name, gains = self._pending
+        name, gains = self._newest
+        if not self.get_parameter("auto_apply").value:
+            return
         if not self._keeper.history.is_open_to(self._place.set_of(gains)):
             return
         doubt = self._results.doubt(name, gains)
         if doubt:
             self._results.refusals.say("to apply gains by itself", name, TuningError(doubt))
-        elif not self._applying:
-            self._applying = True
+        else:
+            self._tried = self._newest
             self.executor.create_task(self._apply_and_tell)
 
     async def _apply_and_tell(self) -> None:
@@ -417,19 +419,17 @@ class ControllerNode(ServedNode):
             self.get_logger().info(await self._apply())
         except RelayAutotuneError as error:
             self.get_logger().error(str(error))
-        finally:
-            self._applying = False
 
     def _acceptable(self) -> tuple[str, Gains]:
-        """Return the gains that wait, with the id of their experiment.
+        """Return the newest gains, with the id of their experiment.
 
         :raises RelayAutotuneError: if there are none, or they may not be applied.
         """
-        if self._pending is None:
+        if self._newest is None:
             raise TuningError(
                 Code.NONE_WAIT(**({"refused": self._refused} if self._refused else {}))
             )
-        name, gains = self._pending
+        name, gains = self._newest
         try:
             # The record may have come after the gains.
             self._results.check(name, gains)
@@ -441,26 +441,23 @@ class ControllerNode(ServedNode):
                 )
         except RelayAutotuneError as error:
             raise _not_in_force(name, error) from error
-        self._offered = self._pending
+        self._tried = self._newest
         self._predictors.applied(self._place.set_of(gains), name)
-        return self._pending
+        return self._newest
 
     async def _apply(self) -> str:
-        name, gains = offered = self._acceptable()
+        name, gains = self._acceptable()
         try:
             done = await self._keeper.apply(self._place.set_of(gains))
         except RelayAutotuneError as error:
             raise _not_in_force(name, error) from error
-        # Newer gains may have arrived meanwhile.
-        if self._pending is offered:
-            self._pending = None
         with suppress(TuningError):
             self._keeper.before()
             done += "; ~/revert brings back those before"
         return f"gains of {name}: {done}"
 
     def _discard(self, _: Trigger.Request) -> str:
-        waiting, self._pending, self._refused = self._pending, None, ""
+        waiting, self._newest, self._refused = self._newest, None, ""
         if waiting is None:
             raise TuningError("no gains wait")
         return "discarded"
@@ -548,15 +545,6 @@ class ControllerNode(ServedNode):
         reason += await self._keeper.end_verification(passed)
         verdict = "ended without a verdict" if passed is None else "passed" if passed else "failed"
         self.get_logger().info(f"verification {verdict}: {reason}")
-        offered, history = self._offered, self._keeper.history
-        if offered is not None:
-            tried = self._place.set_of(offered[1])
-            known = tried == history.gains or tried in history.failed
-            if known and self._pending is offered:
-                self._pending = None
-            elif not known and self._pending is None and not history.is_open_to(tried):
-                # They were taken back, and may be tried again.
-                self._pending = offered
         return reason
 
     # The end.

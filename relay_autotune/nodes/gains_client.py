@@ -9,7 +9,7 @@ import math
 import shlex
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +28,7 @@ from relay_autotune.exchange.messages import (
     record_from_message,
     transfer_function_from_message,
 )
-from relay_autotune.loop.gains import Controller, Gains
+from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.gains_place import gains_at, in_another_node, mapping_of
@@ -94,17 +94,16 @@ class GainsClient(LoopClient):
             return f": {prefix()}{shlex.join(['controller_node', '--ros-args', *words])}"
         return ""
 
-    def waiting(self) -> tuple[Gains, str]:
-        """Return the newest gains of the loop, and why they are doubtful; empty: they are not.
+    def newest(self) -> tuple[Any, str]:
+        """Return the newest `PidGains`, and why they are doubtful; empty: they are not.
 
         :raises LoopError: if there are none.
-        :raises RelayAutotuneError: if they cannot be.
         """
         found = self._result(PidGains, "pi_gains")
         doubt = "" if found.verdict == PidGains.VERDICT_TRUSTED else found.verdict_reason
         if not doubt and found.verdict != PidGains.VERDICT_TRUSTED:
             doubt = "they carry no verdict"
-        return gains_from_message(found), doubt
+        return found, doubt
 
     def identified(self) -> tuple[TransferFunction, float]:
         """Return the newest model of the loop, and the noise in which a step is seen [y].
@@ -131,11 +130,10 @@ class GainsClient(LoopClient):
         """Return the gains in force, also where another node has them; None: there are none."""
         return gains_at(self, *self._there())
 
-    def ask(self, service: str, done: Callable[[], str] = lambda: "") -> str:
-        """Call ~/apply, ~/before, ~/revert or ~/discard, and return its answer.
+    def ask(self, service: str) -> str:
+        """Call ~/apply, ~/before or ~/revert, and return its answer.
 
         :param service: which of them.
-        :param done: returns a sentence where the service need not be asked again; else "".
         :raises LoopError: with the reason, if it refuses.
         """
         deadline = time.monotonic() + ANSWER_WITHIN
@@ -146,8 +144,6 @@ class GainsClient(LoopClient):
             # A Trigger has no field for a code.
             if not may_pass(answer.message) or time.monotonic() > deadline:
                 raise LoopError(f"{self.name} refuses: {answer.message}")
-            if said := done():
-                return said
             self.rest(_TURN)
 
     def has(self, gains: Controller) -> bool:
@@ -160,16 +156,16 @@ class GainsClient(LoopClient):
         return GainSet.of(self.values(node, list(wanted))).is_near(GainSet.of(wanted))
 
     @contextmanager
-    def offered(self, message: Any) -> Iterator[Gains]:
-        """Offer gains as identifier_node does until the end of the block, and return them.
+    def _offered(self, message: Any) -> Iterator[None]:
+        """Offer gains as identifier_node does until the end of the block.
 
-        The gains that waited before are discarded, so that no others can be applied.
+        The newest before are discarded, so that no others than these can be applied: a page may
+        have offered its own since those that are shown.
 
         :param message: the `PidGains`.
         :raises LoopError: if they are in force already.
         """
-        gains = gains_from_message(message)
-        if self.has(gains):
+        if self.has(gains_from_message(message)):
             raise LoopError("these gains are in force already")
         self.call(Trigger, f"{self.name}/discard", Trigger.Request())
         kind = "relay_autotune_msgs/msg/PidGains"
@@ -177,7 +173,7 @@ class GainsClient(LoopClient):
         offer = self._node.create_publisher(PidGains, topic, quality.RESULT)
         try:
             offer.publish(message)
-            yield gains
+            yield
         finally:
             self._node.destroy_publisher(offer)
 
@@ -187,9 +183,8 @@ class GainsClient(LoopClient):
         :param message: the `PidGains`.
         :raises LoopError: with the reason, if they are refused.
         """
-        with self.offered(message) as gains:
-            # auto_apply may be faster.
-            return self.ask("apply", lambda: "the gains are in force" * self.has(gains))
+        with self._offered(message):
+            return self.ask("apply")
 
     @contextmanager
     def allowing(self, **least: float | bool) -> Iterator[None]:
@@ -235,7 +230,7 @@ class GainsClient(LoopClient):
         values = self.values(self.name, names)
         if not values["apply_to"]:
             return Control(gains, rate_from(values))
-        newest, _ = self.waiting()
+        newest = gains_from_message(self.newest()[0])
         rate = rate_of(newest.law, newest.law_period)
         return in_another_node(gains, rate, values["apply_feedforward"])
 
@@ -246,7 +241,7 @@ class GainsClient(LoopClient):
         patience: float,
         tell: Callable[[str], None],
         leave: Callable[[], bool] = lambda: False,
-        new: Controller | None = None,
+        new: Any = None,
     ) -> Any:
         """Verify with a step that the user has agreed to, whatever the node allows otherwise.
 
@@ -258,17 +253,20 @@ class GainsClient(LoopClient):
         :param patience: how long to wait until the loop is at rest [s].
         :param tell: called at least each second with what is waited for.
         :param leave: returns True to end the verification without a verdict.
-        :param new: the gains that wait, if they are to be put in force; None: those in force are
-            tried.
+        :param new: the `PidGains` that are to be put in force; None: those in force are tried.
         :return: the `Verify.Result`.
         :raises LoopError: with the reason, if there is no verdict.
         """
         target, places = self._there()
         there = self.values(target, list(places.values()))
         goal = Verify.Goal(setpoint_step=setpoint, load_step=load, patience=patience)
-        with self.allowing(verify_step_max=abs(setpoint)):
+        goal.apply = new is not None
+        with (
+            self.allowing(verify_step_max=abs(setpoint)),
+            self._offered(new) if new else nullcontext(),
+        ):
             try:
-                return self._verified(goal, new, tell, leave)
+                return self._verified(goal, tell, leave)
             except GoneError as error:
                 raise GoneError(f"{error}; {self._taken_back(target, there)}") from error
 
@@ -335,16 +333,9 @@ class GainsClient(LoopClient):
             tell(f"{what}, {duration(waited)} of {duration(seconds)}")
             self.wait(leave, min(TOLD_EVERY, seconds - waited))
 
-    def _verified(
-        self,
-        goal: Any,
-        new: Controller | None,
-        tell: Callable[[str], None],
-        leave: Callable[[], bool],
-    ) -> Any:
+    def _verified(self, goal: Any, tell: Callable[[str], None], leave: Callable[[], bool]) -> Any:
         """Have the steps made, and return the `Verify.Result`."""
         begun = time.monotonic()
-        goal.apply = new is not None
         while not leave():
             sent = self._sent(goal, lambda found: tell(visible(found.status)))
             answer = self._ended(sent, leave)
@@ -354,8 +345,6 @@ class GainsClient(LoopClient):
             early = reason_from_message(result.why).code.row.transient
             if not early or time.monotonic() - begun > ANSWER_WITHIN:
                 raise LoopError(f"{self.name} has not verified the gains: {result.reason}")
-            # auto_apply may be faster.
-            goal.apply = goal.apply and not (new is not None and self.has(new))
             tell(f"waiting: {result.reason}")
             self.wait(leave, TOLD_EVERY)
         raise LoopError("the verification was ended before it began: the gains are as before")

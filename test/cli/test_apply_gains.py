@@ -205,8 +205,8 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     asked: list[str] = []
     client: Any = SimpleNamespace(
         in_force=lambda: None, identified=lambda: (MODEL, 0.01),
-        waiting=lambda: (GAINS, ""), has=lambda gains: False, ask=asked.append,
-        steps=lambda gains: StepsWithin(2.0 if gains is GAINS else 0.0),
+        newest=lambda: (MESSAGE, ""), has=lambda gains: False, prove=asked.append,
+        steps=lambda gains: StepsWithin(2.0 if gains == GAINS else 0.0),
         name="controller_node",
     )  # fmt: skip
     given = apply_gains._parser().parse_args(["--yes", "--step", "2.5"])
@@ -273,7 +273,7 @@ def test_a_proof_says_what_happens_if_it_fails_and_then_holds_no_command(
     did: list[str] = []
     for passed in (False, True):
         node = SimpleNamespace(
-            find=lambda *_: None, offered=nullcontext, steps_of=lambda _: [],
+            find=lambda *_: None, steps_of=lambda _: [],
             prove=lambda *_, passed=passed: did.append("proof") or Verify.Result(passed=passed),
             let_settle=lambda *_: did.append("settles"),
         )  # fmt: skip
@@ -300,7 +300,7 @@ def test_a_plan_counts_the_time_in_which_the_loop_settles_with_new_gains() -> No
 def client_of(prove: Any, in_force: Any) -> Any:
     return SimpleNamespace(
         in_force=in_force, identified=lambda: (MODEL, 0.01),
-        waiting=lambda: (GAINS, ""), has=lambda gains: in_force() is gains,
+        newest=lambda: (MESSAGE, ""), has=lambda gains: in_force() == gains,
         steps=lambda gains: StepsHere(None, 0.0), name="controller_node", prove=prove,
         allowing=lambda **least: nullcontext(),
     )  # fmt: skip
@@ -312,7 +312,7 @@ def test_ctrl_c_in_a_proof_ends_it_and_the_last_line_says_what_is_in_force(
     """The signal is noted, and obeyed when the node has taken the gains back."""
 
     def prove(step: float, load: float, wait: float, tell: Any, leave: Any, new: Any) -> None:
-        assert new is GAINS and not leave()
+        assert new is MESSAGE and not leave()
         os.kill(os.getpid(), signal.SIGINT)
         assert leave()
         raise LoopError("cancelled; kc 0.1 in force again")
@@ -369,7 +369,7 @@ def test_the_page_refuses_a_step_beyond_the_limits_before_anything_changes() -> 
     changed: list[Any] = []
     controller: Any = SimpleNamespace(
         in_force=lambda: Controller(0.1, 3.0), steps=lambda gains: StepsWithin(2.0),
-        offered=changed.append, prove=lambda *words: changed.append(words),
+        prove=lambda *words: changed.append(words),
         name="/controller_node", find=lambda patience: None, steps_of=lambda result: [],
         allowing=lambda **least: nullcontext(),
     )  # fmt: skip

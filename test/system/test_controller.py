@@ -126,7 +126,8 @@ def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -
     assert "step 1 of 2, set-point +0.2 y, " in said
     assert re.search(r"the measurement is \S+ y\b", said)
     assert "step 2 of 2, load +0.1 u, " in controller.log
-    assert parameters_of(rig) == [gains[-1].kc, gains[-1].ti]
+    tuned = [gains[-1].kc, gains[-1].ti]
+    assert parameters_of(rig) == tuned
     full = rig.listen("verification", Verification)
     rig.until(lambda: len(full) == 2, "the samples of both steps")
     assert [s.kind for s in full] == [1, 2]
@@ -140,6 +141,18 @@ def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -
     reverted = trigger(rig, "revert")
     assert "kc 0.3" in reverted.message
     assert parameters_of(rig) == [0.3, 0.8]
+    # The gains that are shown are applied again, and no others that a page has offered since.
+    offer = rig.node.create_publisher(PidGains, "pi_gains", LATCHED)
+    other = PidGains(final=True, verdict=PidGains.VERDICT_TRUSTED, kc=0.31, ti=0.8, b=1.0)
+    other.experiment_id = "page"
+    offer.publish(other)
+    rig.until(lambda: "gains of page wait" in controller.log, "the gains of a page")
+    rig.node.destroy_publisher(offer)
+    again = rig.start_command("apply_gains", "--yes", "--no-verify")
+    rig.until(lambda: not again.running, "the command", timeout=90.0)
+    assert again.wait() == 0, again.log
+    assert parameters_of(rig) == tuned
+    assert trigger(rig, "revert").success
     # While the predictions were computed, each measurement was answered.
     assert "has been silent" not in relay.log
     # Manual mode.

@@ -12,7 +12,10 @@ import signal
 import pytest
 from hand_loop import SETPOINT, HandLoop
 from loop_rig import RELIABLE, Rig
+from made_experiments import experiment_of
 from std_msgs.msg import Float64
+
+from relay_autotune.process.transfer_function import TransferFunction as Process
 
 GOOD, WILD = (0.5, 0.6), (0.9, 0.3)
 
@@ -243,7 +246,29 @@ def test_gains_are_put_in_force_and_proven_in_one_go_or_not_at_all(rig: Rig) -> 
     result = loop.verify(setpoint_step=0.3, apply=True, patience=60.0)
     assert result.passed, result.reason
     assert loop.gains_shown() == GOOD
+    # Who has reverted may think better of it, and none before are lost.
+    assert loop.trigger("revert").success
+    assert loop.gains_shown() == (0.3, 1.0)
+    for _ in range(2):
+        assert loop.trigger("apply").success
+        assert loop.gains_shown() == GOOD
+    assert loop.verify(setpoint_step=0.3, apply=True, patience=60.0).passed
+    assert loop.trigger("before").message == "kc 0.3, ti 1 s, td 0 s"
+    assert loop.trigger("discard").success
     assert "no gains wait" in loop.verify(setpoint_step=0.3, apply=True).reason
+
+
+def test_gains_that_were_taken_back_are_not_applied_without_being_asked(rig: Rig) -> None:
+    loop = HandLoop(rig, kc=0.3, ti=1.0, auto_apply=True)
+    loop.offer(*GOOD, "good")
+    rig.until(lambda: loop.gains_shown() == GOOD, "auto_apply")
+    assert loop.trigger("revert").success
+    # A record or a model that comes late makes it look at them again.
+    loop.experiments.publish(experiment_of(Process.fopdt(2.0, 0.5, 0.2), "another"))
+    loop.step(20)
+    assert loop.gains_shown() == (0.3, 1.0)
+    assert loop.trigger("apply").success
+    assert loop.gains_shown() == GOOD
 
 
 def test_a_change_that_cannot_be_stored_is_refused(rig: Rig) -> None:
