@@ -680,7 +680,7 @@ class Code(enum.IntEnum):
     """A step is predicted by the model of the same experiment."""
     DOUBTFUL_MODEL = _Row(
         513,
-        "the model that would predict the step is {doubt}",
+        "the model that would predict the step is not trusted: {doubt}",
         "set the parameter accept_doubtful to true to step all the same",
         typed="accept_doubtful true",
     )

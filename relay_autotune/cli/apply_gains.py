@@ -41,7 +41,11 @@ from relay_autotune.cli.terminal import (
     write,
 )
 from relay_autotune.errors import LoopError, TuningError
-from relay_autotune.exchange.messages import gains_from_message, reason_from_message
+from relay_autotune.exchange.messages import (
+    gains_from_message,
+    reason_from_message,
+    why_doubtful,
+)
 from relay_autotune.reasons import Code
 from relay_autotune.text import digits, duration
 
@@ -157,18 +161,18 @@ def _write(client: GainsClient, options: argparse.Namespace) -> int:
     from relay_autotune.exchange.export import Target, exported
     from relay_autotune.loop.laws import LAWS, OWN_LAW
 
-    message, doubt = client.newest()
+    message = client.newest()
     gains = gains_from_message(message)
-    _require_trust(doubt, options)
+    _require_trust(message, options)
     how = gains.law or OWN_LAW
-    write(exported(gains, how, Target(), doubt=doubt), options.file)
+    write(exported(gains, how, Target(), doubt=why_doubtful(message)), options.file)
     load = f"; load it with ros2 param load /pid_controller {options.file}"
     print(f"written for {how}: {options.file}{load if LAWS[how].sets_gains else ''}")
     return DONE
 
 
-def _require_trust(doubt: str, options: argparse.Namespace) -> None:
-    if doubt and not options.accept_doubtful:
+def _require_trust(message: Any, options: argparse.Namespace) -> None:
+    if (doubt := why_doubtful(message)) and not options.accept_doubtful:
         raise TuningError(
             f"the gains are doubtful: {doubt}; give --accept-doubtful to have them all the same"
         )
@@ -183,10 +187,10 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
     """
     with Working("asking for the gains"):
         present, (model, _) = client.in_force(), client.identified()
-        message, doubt = client.newest()
+        message = client.newest()
     gains = gains_from_message(message)
     if not options.verify_only:
-        _require_trust(doubt, options)
+        _require_trust(message, options)
         if client.has(gains):
             raise TuningError("the new gains are in force already: give --verify-only for a step")
         print("\n".join(beside(present, gains, model, width())))

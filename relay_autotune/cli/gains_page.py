@@ -19,6 +19,7 @@ from relay_autotune.errors import LoopError, RelayAutotuneError, TuningError
 from relay_autotune.exchange.messages import (
     fill_gains,
     gains_from_message,
+    why_doubtful,
 )
 from relay_autotune.loop.gains import Controller
 from relay_autotune.nodes.gains_client import GainsClient, StepsHere
@@ -142,8 +143,8 @@ class GainsPage:
             after = "; at once, without a bump of the command"
         if message is not None:
             yield "", "new gains", f"{gains_words(gains_from_message(message))}{after}"
-            if message.verdict != PidGains.VERDICT_TRUSTED:
-                yield "note", "doubtful", message.verdict_reason
+            if doubt := why_doubtful(message):
+                yield "note", "doubtful", doubt
         if wish.what == REVERT:
             yield "", "new gains", f"those before: {self._found().ask('before')}{after}"
         elif wish.what == APPLY:

@@ -24,6 +24,7 @@ from relay_autotune.cli.terminal import UNITS, WIDEST, labelled
 from relay_autotune.exchange.messages import (
     identification_from_message,
     transfer_function_from_message,
+    why_doubtful,
 )
 from relay_autotune.nodes.shell import prefix
 from relay_autotune.process.transfer_function import process_text
@@ -262,7 +263,7 @@ def next_commands(
             words = [f"{prefix()}apply_gains"]
             words += ["--namespace", namespace] if namespace else []
             words += ["--node", node] if node != "controller_node" else []
-            words += ["--accept-doubtful"] if result.verdict != Verdict.TRUSTED else []
+            words += ["--accept-doubtful"] if why_doubtful(result) else []
             steps.append(("apply and verify the gains", " ".join(words)))
     return steps
 

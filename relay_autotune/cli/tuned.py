@@ -27,7 +27,11 @@ from relay_autotune.control.controller import Control
 from relay_autotune.control.step_choice import StepChoice, StepRange
 from relay_autotune.control.verification import RUNAWAY, SETTLES, noise_of
 from relay_autotune.errors import TuningError
-from relay_autotune.exchange.messages import gains_from_message, transfer_function_from_message
+from relay_autotune.exchange.messages import (
+    gains_from_message,
+    transfer_function_from_message,
+    why_doubtful,
+)
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes.gains_client import GainsClient
@@ -81,8 +85,7 @@ class Tuned:
     @property
     def doubt(self) -> str:
         """Why the gains are doubtful; empty: they are trusted."""
-        trusted = self.result.verdict == Verdict.TRUSTED
-        return "" if trusted else str(self.result.verdict_reason)
+        return why_doubtful(self.result)
 
     @cached_property
     def left(self) -> str:

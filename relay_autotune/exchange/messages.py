@@ -420,6 +420,16 @@ def fill_gains(
     to_message(message, gains)
 
 
+def why_doubtful(message: Any) -> str:
+    """Return why a result is doubtful; empty: it is trusted.
+
+    :param message: the `PidGains`, `TransferFunction` or `Tune.Result`.
+    """
+    if message.verdict == Verdict.TRUSTED:
+        return ""
+    return message.verdict_reason or "no verdict was given"
+
+
 def made_visible(message: Any) -> Any:
     """Return a message of another node, in whose texts nothing acts on a terminal or a log.
 

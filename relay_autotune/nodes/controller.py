@@ -33,6 +33,7 @@ from relay_autotune.errors import (
     TuningError,
 )
 from relay_autotune.exchange.export import TOPICS
+from relay_autotune.exchange.messages import why_doubtful
 from relay_autotune.loop.analysis import is_stable
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.nodes import quality, tables
@@ -50,7 +51,7 @@ from relay_autotune.nodes.goals import serve
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import command_reader, reader_of
 from relay_autotune.nodes.parameters import ask_before_changes, declare, merged, values_of
-from relay_autotune.nodes.results import ResultCheck, why_doubtful
+from relay_autotune.nodes.results import ResultCheck
 from relay_autotune.nodes.verifier import Predictors, Verifiable, Verifier
 from relay_autotune.nodes.watch import Following, Repeater, require_own_time
 from relay_autotune.reasons import Code, Reason
@@ -376,7 +377,7 @@ class ControllerNode(ServedNode):
         self._newest, self._refused = (name, gains), ""
         self._doubt = why_doubtful(message)
         if self._doubt:
-            self.get_logger().warning(f"gains of {name} are {self._doubt}")
+            self.get_logger().warning(f"gains of {name} are not trusted: {self._doubt}")
         asked = self.get_parameter("auto_apply").value
         cut_short = not self._keeper.history.is_open_to(self._place.set_of(gains))
         if self._doubt or cut_short or not asked:
@@ -436,8 +437,8 @@ class ControllerNode(ServedNode):
             self._settings.bounds.require(gains)
             if self._doubt and not self.get_parameter("accept_doubtful").value:
                 raise TuningError(
-                    f"they are {self._doubt}; set the parameter accept_doubtful to true to have "
-                    "them all the same"
+                    f"they are not trusted: {self._doubt}; set the parameter accept_doubtful to "
+                    "true to have them all the same"
                 )
         except RelayAutotuneError as error:
             raise _not_in_force(name, error) from error

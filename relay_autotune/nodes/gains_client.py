@@ -94,16 +94,12 @@ class GainsClient(LoopClient):
             return f": {prefix()}{shlex.join(['controller_node', '--ros-args', *words])}"
         return ""
 
-    def newest(self) -> tuple[Any, str]:
-        """Return the newest `PidGains`, and why they are doubtful; empty: they are not.
+    def newest(self) -> Any:
+        """Return the newest `PidGains` of the loop.
 
         :raises LoopError: if there are none.
         """
-        found = self._result(PidGains, "pi_gains")
-        doubt = "" if found.verdict == PidGains.VERDICT_TRUSTED else found.verdict_reason
-        if not doubt and found.verdict != PidGains.VERDICT_TRUSTED:
-            doubt = "they carry no verdict"
-        return found, doubt
+        return self._result(PidGains, "pi_gains")
 
     def identified(self) -> tuple[TransferFunction, float]:
         """Return the newest model of the loop, and the noise in which a step is seen [y].
@@ -230,7 +226,7 @@ class GainsClient(LoopClient):
         values = self.values(self.name, names)
         if not values["apply_to"]:
             return Control(gains, rate_from(values))
-        newest = gains_from_message(self.newest()[0])
+        newest = gains_from_message(self.newest())
         rate = rate_of(newest.law, newest.law_period)
         return in_another_node(gains, rate, values["apply_feedforward"])
 

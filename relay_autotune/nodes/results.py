@@ -30,13 +30,13 @@ from relay_autotune.exchange.messages import (
     gains_from_message,
     record_from_message,
     transfer_function_from_message,
+    why_doubtful,
 )
 from relay_autotune.loop.gains import Gains
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record
-from relay_autotune.verdict import Verdict
 
 if TYPE_CHECKING:
     from relay_autotune.nodes.session import Session
@@ -346,18 +346,6 @@ class OwnResults(ResultCheck):
             facts = replace(ExperimentFacts.of(record), whole=False)
             self._so_far = of, facts, float(np.ptp(record.measurement))
         return self._so_far[1:]
-
-
-def why_doubtful(message: Any) -> str:
-    """Return why a result needs accept_doubtful before it is used; empty: it is trusted.
-
-    :param message: the `PidGains` or `TransferFunction`.
-    """
-    if message.verdict == Verdict.TRUSTED:
-        return ""
-    if message.verdict == Verdict.UNKNOWN:
-        return "not judged, since it carries no verdict"
-    return f"not trusted: {message.verdict_reason}"
 
 
 def keep(known: dict[Any, Any], name: Any, value: Any) -> None:

@@ -22,12 +22,12 @@ from relay_autotune.cli.apply_gains import Entries, found_entries, verified
 from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import labelled
-from relay_autotune.cli.tuned import Proof
+from relay_autotune.cli.tuned import Proof, Tuned
 from relay_autotune.control.controller import Control, Step
 from relay_autotune.control.step_choice import StepChoice, StepRange
 from relay_autotune.control.verification import plan
 from relay_autotune.errors import LoopError, TuningError
-from relay_autotune.exchange.messages import fill_gains, fill_reason
+from relay_autotune.exchange.messages import fill_gains, fill_reason, why_doubtful
 from relay_autotune.loop.analysis import performance_beside
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.sampled import Limits
@@ -40,6 +40,7 @@ from relay_autotune.record.record import Record, RelaySettings
 from relay_autotune.text import duration
 from relay_autotune.tuning import design
 from relay_autotune.tuning.task import DesignOptions, DesignTask
+from relay_autotune.verdict import Verdict
 from relay_autotune.web.live import PROVE, VERIFY, Live, PageCommand
 from relay_autotune_msgs.action import Tune, Verify
 from relay_autotune_msgs.msg import PidGains, Verification
@@ -49,6 +50,7 @@ MODEL = TransferFunction.fopdt(1.65, 1.0, 0.5)
 GAINS = design(DesignTask(model=MODEL, options=DesignOptions()), "imc")
 MESSAGE = PidGains()
 fill_gains(MESSAGE, GAINS, experiment_id="x")
+MESSAGE.verdict = PidGains.VERDICT_TRUSTED
 
 
 def nothing_before(service: str) -> str:
@@ -205,7 +207,7 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     asked: list[str] = []
     client: Any = SimpleNamespace(
         in_force=lambda: None, identified=lambda: (MODEL, 0.01),
-        newest=lambda: (MESSAGE, ""), has=lambda gains: False, prove=asked.append,
+        newest=lambda: MESSAGE, has=lambda gains: False, prove=asked.append,
         steps=lambda gains: StepsWithin(2.0 if gains == GAINS else 0.0),
         name="controller_node",
     )  # fmt: skip
@@ -233,6 +235,19 @@ def test_a_step_by_nothing_is_refused(program: Any, capsys: pytest.CaptureFixtur
         program.main(["--step", "0"])
     assert ended.value.code == 2
     assert "argument --step: expected a step up or down, found 0;" in capsys.readouterr().err
+
+
+def test_doubtful_gains_say_why_and_so_do_those_without_a_verdict() -> None:
+    """A tune took gains without a verdict for trusted."""
+    for kind in (PidGains, TransferFunctionMessage, Tune.Result):
+        assert why_doubtful(kind(verdict=int(Verdict.TRUSTED))) == ""
+        assert why_doubtful(kind()) == "no verdict was given"
+        doubtful = kind(verdict=int(Verdict.DOUBTFUL), verdict_reason="the data drift")
+        assert why_doubtful(doubtful) == "the data drift"
+    unknown: Any = SimpleNamespace(client=None, options=None)
+    tune = Tuned(unknown)
+    tune.result = Tune.Result(gains=MESSAGE)
+    assert tune.doubt == "no verdict was given"
 
 
 def test_without_a_record_of_a_tune_the_node_alone_refuses_a_step() -> None:
@@ -300,7 +315,7 @@ def test_a_plan_counts_the_time_in_which_the_loop_settles_with_new_gains() -> No
 def client_of(prove: Any, in_force: Any) -> Any:
     return SimpleNamespace(
         in_force=in_force, identified=lambda: (MODEL, 0.01),
-        newest=lambda: (MESSAGE, ""), has=lambda gains: in_force() == gains,
+        newest=lambda: MESSAGE, has=lambda gains: in_force() == gains,
         steps=lambda gains: StepsHere(None, 0.0), name="controller_node", prove=prove,
         allowing=lambda **least: nullcontext(),
     )  # fmt: skip

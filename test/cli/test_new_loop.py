@@ -838,7 +838,8 @@ def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
     assert "the sensor of /tank/level (--dry-run tells its rate)" in told
     assert told.endswith("for a longer silence give --measurement-timeout")
     assert repeated(ended(Code.CANCELLED()), None) == [("run it again", again)]
-    found = ended(core.NONE, gains=PidGains(experiment_id="x"))
+    trusted = Tune.Result.VERDICT_TRUSTED
+    found = ended(core.NONE, gains=PidGains(experiment_id="x"), verdict=trusted)
     assert repeated(found, None) == [("prove the gains", f"{again} --verify")]
     assert repeated(found, True) == []
     # The file is written, and what is doubtful is proven only where a person agrees.
