@@ -66,13 +66,17 @@ def with_gains_file(words: Sequence[str]) -> list[str]:
     """Return a command line with --gains FILE as ROS takes it.
 
     :param words: the arguments of controller_node.
-    :raises ParameterError: if the file cannot be read.
+    :raises ParameterError: if there is no file, or it cannot be read.
     """
     found = list(words)
     if FLAG not in found:
         return found
     at = found.index(FLAG)
-    file = "".join(found[at + 1 : at + 2])
+    file = next(iter(found[at + 1 :]), "--")
+    if file.startswith("--"):
+        raise ParameterError(
+            f"{FLAG} has no file; expected one that tune_loop has written for a controller_node"
+        )
     given = ["--params-file", file]
     for name, topic in _topics(file).items():
         given += ["-r", f"{name}:={topic}"]

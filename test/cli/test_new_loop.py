@@ -1068,6 +1068,13 @@ def test_a_file_of_gains_that_is_none_is_refused(text: str | None, tmp_path: Pat
         with_gains_file(["--gains", str(file)])
 
 
+@pytest.mark.parametrize("words", [[], ["--ros-args", "-p", "kc:=1.0"]])
+def test_gains_without_a_file_are_refused(words: list[str]) -> None:
+    """They were told as a directory that cannot be read."""
+    with pytest.raises(ParameterError, match="--gains has no file; expected one that tune_loop"):
+        with_gains_file(["--gains", *words])
+
+
 def test_a_launch_file_starts_the_controller_with_limits_and_topics() -> None:
     gains = design(
         DesignTask(model=TransferFunction.fopdt(1.65, 1.0, 0.5), options=DesignOptions()), "imc"
