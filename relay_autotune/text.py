@@ -116,6 +116,9 @@ def date_text(start: float) -> str:
         return f"{start:g} s after 1970"
 
 
+# Of a node or a topic; a full name has a slash first.
+NAME_OF_ROS = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*\Z", re.ASCII)
+
 # A spreadsheet takes a cell that begins with one of these for a formula.
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 

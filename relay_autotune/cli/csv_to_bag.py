@@ -15,6 +15,7 @@ from relay_autotune.bag.signals import Selection
 from relay_autotune.cli.arguments import DONE, Parser, finite, run_command, say
 from relay_autotune.cli.jobs import add_times
 from relay_autotune.errors import BagError, SelectionError
+from relay_autotune.text import NAME_OF_ROS
 
 PROGRAM = "csv_to_bag"
 
@@ -84,7 +85,7 @@ def _convert(options: argparse.Namespace) -> int:
         options.command_topic or topic_name(command.name),
     )
     for topic in topics:
-        if not re.fullmatch(r"(/[A-Za-z_]\w*)+", topic):
+        if not (topic.startswith("/") and NAME_OF_ROS.match(topic)):
             raise SelectionError(
                 f"{topic!r} is not a topic name; expected one like /tank/level, "
                 f"given with --measurement-topic and --command-topic"

@@ -22,7 +22,7 @@ from relay_autotune.loop.gains import Gains
 from relay_autotune.loop.laws import LAWS, OWN_LAW, ProgramLaw
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import result_fields
-from relay_autotune.text import digits, in_units, percent
+from relay_autotune.text import NAME_OF_ROS, digits, in_units, percent
 
 _DIGITS = 10
 LAUNCH = "launch"
@@ -31,7 +31,6 @@ EXPORTS = (*LAWS, "yaml", LAUNCH)
 _DOF = re.compile(r"[\w.-]+(/[\w.-]+)*\Z", re.ASCII)
 # Names that YAML reads as text without quotes.
 _PLAIN = re.compile(r"[A-Za-z_]\w*(/\w+)*\Z", re.ASCII)
-_NODE = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*\Z")
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class Target:
     is_set_up: bool = False
 
     def __post_init__(self) -> None:
-        if not _NODE.match(self.node):
+        if not NAME_OF_ROS.match(self.node):
             raise SelectionError(f"{self.node!r} is not a node name, such as /pid_controller")
         if not _DOF.match(self.dof):
             raise SelectionError(

@@ -17,7 +17,7 @@ from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.duration import Duration
-from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
+from rclpy.exceptions import NameValidationException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -66,6 +66,11 @@ def readable(
     return hear
 
 
+def _why_invalid(error: NameValidationException) -> str:
+    """Return in a part of a sentence why rclpy takes something for no name."""
+    return str(error).splitlines()[0].partition(": ")[2].rstrip(":")
+
+
 class GoneError(LoopError):
     """A node has gone, or does not answer any more."""
 
@@ -98,9 +103,9 @@ class LoopClient:
         try:
             validate_namespace(f"/{namespace.strip('/')}")
             validate_topic_name(f"{node}/tune")
-        except (InvalidNamespaceException, InvalidTopicNameException) as error:
-            text = str(error).splitlines()[0].rstrip(":")
-            raise ParameterError(f"no node can be {namespace}/{node}: {text}") from None
+        except NameValidationException as error:
+            why = _why_invalid(error)
+            raise ParameterError(f"no node can be {namespace}/{node}: {why}") from None
         self.why_lost: Callable[[], str] = beside.why_lost if beside else lambda: ""
         """Tells why it is no use to wait any longer; empty: it is."""
         self._ends = ExitStack()
@@ -535,9 +540,8 @@ class LoopClient:
     def _resolved(self, topic: str) -> str:
         try:
             validate_topic_name(topic)
-        except InvalidTopicNameException as error:
-            text = str(error).splitlines()[0].removeprefix("Invalid topic name: ").rstrip(":")
+        except NameValidationException as error:
             raise ParameterError(
-                f"no topic can be {topic!r}: {text}; give one such as /tank/level"
+                f"no topic can be {topic!r}: {_why_invalid(error)}; give one such as /tank/level"
             ) from None
         return str(self._node.resolve_topic_name(topic))

@@ -139,6 +139,18 @@ def test_a_node_that_starts_late_is_asked_again_until_it_answers_or_has_ended() 
             client.call(None, "/loop/node/revert", None)
 
 
+@pytest.mark.parametrize(
+    ("space", "node", "why"),
+    [
+        ("tank", "relay node", "topic name must not contain characters other"),
+        ("ta nk", "relay_node", "namespace must not contain characters other"),
+    ],
+)
+def test_what_cannot_be_a_node_is_refused_in_one_line(space: str, node: str, why: str) -> None:
+    with pytest.raises(ParameterError, match=f"^no node can be {space}/{node}: {why}[^\n]*[^:]$"):
+        LoopClient("own", space, node)
+
+
 def test_no_two_joints_share_the_namespace_of_their_nodes() -> None:
     joints = (
         "odd/name",

@@ -424,9 +424,10 @@ def test_csv_to_bag_refuses_what_it_cannot_do(tmp_path, capsys):
     unclear.write_text("t,a,b,c\n0,1,2,3\n1,1,2,3\n")
     assert csv_to_bag.main([str(unclear), str(tmp_path / "bag")]) == 2
     assert "name two of them" in capsys.readouterr().err
-    bad = ("--measurement-topic", "no topic")
-    assert csv_to_bag.main([str(path), str(tmp_path / "bag"), *columns, *bad]) == 2
-    assert "'no topic' is not a topic name" in capsys.readouterr().err
+    for name in ("no topic", "level", "/tank/", "/füllstand"):
+        bad = ("--measurement-topic", name)
+        assert csv_to_bag.main([str(path), str(tmp_path / "bag"), *columns, *bad]) == 2
+        assert f"{name!r} is not a topic name" in capsys.readouterr().err
     assert csv_to_bag.main([str(path), str(tmp_path / "bag"), *columns, "--epoch", "-9"]) == 1
     assert "no time before 1970" in capsys.readouterr().err
     assert csv_to_bag.main([str(path), str(tmp_path), *columns]) == 1
