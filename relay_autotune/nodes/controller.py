@@ -366,16 +366,14 @@ class ControllerNode(ServedNode):
     def _on_gains(self, message: Any) -> None:
         if not message.final:
             return
-        name, gains = message.experiment_id, self._results.gains(message)
+        name = message.experiment_id
         try:
-            if gains is not None:
-                self._place.require_law(gains)
-                self._settings.bounds.require(gains)
-                self._keeper.history.require_not_failed(self._place.set_of(gains))
+            gains = self._results.gains(message)
+            self._place.require_law(gains)
+            self._settings.bounds.require(gains)
+            self._keeper.history.require_not_failed(self._place.set_of(gains))
         except RelayAutotuneError as error:
             self._results.refusals.say("gains", name, error)
-            gains = None
-        if gains is None:
             self._refused = self._results.refusals.last
             return
         self._newest, self._refused = (name, gains), ""

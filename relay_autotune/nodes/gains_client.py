@@ -286,7 +286,7 @@ class GainsClient(LoopClient):
                 "nobody controls the loop; started again, it begins with the gains that were "
                 "proven, or with those of its parameters"
             )
-        gains = ", ".join(f"{name} {value:.6g}" for name, value in before.items())
+        gains = GainSet.of(before)
         with suppress(LoopError):
             if self.values(target, list(before)) != before:
                 self.set_values(target, before)

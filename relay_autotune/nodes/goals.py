@@ -171,7 +171,7 @@ class TuneAction:
     """Serve the action. A tune may begin while the one before waits for its gains.
 
     :param node: the node.
-    :param ready: returns once a tune may be asked for.
+    :param ready: done once a tune may be asked for.
     :param start: takes an amplitude [u] and whether it is a dry run; starts or checks a tune, and
         says what became of it.
     :param cancel: called with the id of an experiment when its client cancels it.
@@ -180,7 +180,7 @@ class TuneAction:
     def __init__(
         self,
         node: ServedNode,
-        ready: Callable[[], Awaitable[None]],
+        ready: Awaitable[None],
         start: Callable[[float, bool], StartTune.Response],
         cancel: Callable[[str], None],
     ) -> None:
@@ -201,7 +201,7 @@ class TuneAction:
 
     async def _begin(self, goal: Any) -> None:
         request = goal.request
-        await self._ready()
+        await self._ready
         if goal.is_cancel_requested:
             started = refused(Code.CANCELLED())
         else:

@@ -32,7 +32,7 @@ from relay_autotune.nodes.recording import Recordings
 from relay_autotune.nodes.results import MODEL, OwnResults, said_by
 from relay_autotune.nodes.session import Session, SetpointSession
 from relay_autotune.nodes.tables import FIXED_PARAMETERS, TUNE_PARAMETERS
-from relay_autotune.nodes.watch import Arrival, Sensor
+from relay_autotune.nodes.watch import Sensor, arrival
 from relay_autotune.reasons import Code, Reason
 from relay_autotune.record.record import Cycle, Outcome
 from relay_autotune.text import duration
@@ -88,12 +88,12 @@ class RelayNode(ServedNode):
         self._topic = self._ends.measurement.topic_name
         self._recordings = Recordings(self, self._ends.recorded)
         self._results = OwnResults(self)
-        self._arrival = Arrival(self)
+        self._arrival = arrival(self)
         # The others of the loop go on while it waits.
         waiting = ReentrantCallbackGroup()
         self.create_service(StartTune, "~/start_tune", self._on_start, callback_group=waiting)
         serve(self, Trigger, "~/abort", self._abort)
-        self._action = TuneAction(self, self._arrival.is_over, self._request, self._cancel)
+        self._action = TuneAction(self, self._arrival, self._request, self._cancel)
         # Those whose gains are awaited, by their ids.
         self._waiting: dict[str, Session] = {}
         self._narrator = Narrator(self, self._words, self._tell)
@@ -181,7 +181,7 @@ class RelayNode(ServedNode):
     async def _on_start(
         self, request: StartTune.Request, _: StartTune.Response
     ) -> StartTune.Response:
-        await self._arrival.is_over()
+        await self._arrival
         return self._request(request.amplitude, request.dry_run)
 
     def _request(self, amplitude: float, dry_run: bool) -> StartTune.Response:

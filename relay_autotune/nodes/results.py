@@ -211,21 +211,17 @@ class ResultCheck:
             keep(self.models, name, (model, why_doubtful(message)))
         return model
 
-    def gains(self, message: Any) -> Gains | None:
-        """Return the gains in a message, None if they are refused.
+    def gains(self, message: Any) -> Gains:
+        """Return the gains in a message.
 
         Gains of an unknown experiment without a model are accepted, because a user who applies
         them by hand may know more. :meth:`doubt` reports them.
 
         :param message: the `PidGains`.
+        :raises RelayAutotuneError: if they are refused.
         """
-        name = message.experiment_id
-        try:
-            gains = gains_from_message(message)
-            self.check(name, gains)
-        except RelayAutotuneError as error:
-            self.refusals.say("gains", name, error)
-            return None
+        gains = gains_from_message(message)
+        self.check(message.experiment_id, gains)
         return gains
 
     def doubt(self, experiment_id: str, gains: Gains) -> str:
@@ -309,7 +305,12 @@ class OwnResults(ResultCheck):
         if message.final and experiment_id in self._evidence and experiment_id not in self.models:
             self._early = name, message
             return []
-        return [(name, message)] if self.gains(message) is not None else []
+        try:
+            self.gains(message)
+        except RelayAutotuneError as error:
+            self.refusals.say("gains", experiment_id, error)
+            return []
+        return [(name, message)]
 
     def _why_not_running(
         self, name: str, message: Any, running: Session, on_setpoint: bool

@@ -458,23 +458,19 @@ class Watch:
     every: int = 1
 
 
-class Arrival:
-    """Wait until a node that has just started must know all others of its graph.
+def arrival(node: Node) -> Future:
+    """Return what is done once a node that has just started must know all others of its graph.
 
     :param node: the node.
     """
+    known: Future = Future()
 
-    def __init__(self, node: Node) -> None:
-        self._known: Future = Future()
-        self._timer = node.create_timer(quality.ALL_KNOWN_AFTER, self._end, clock=STEADY)
+    def end() -> None:
+        timer.cancel()
+        known.set_result(None)
 
-    def _end(self) -> None:
-        self._timer.cancel()
-        self._known.set_result(None)
-
-    async def is_over(self) -> None:
-        """Return once it must."""
-        await self._known
+    timer = node.create_timer(quality.ALL_KNOWN_AFTER, end, clock=STEADY)
+    return known
 
 
 def second_publisher(node: Node, topic: str) -> Reason | None:

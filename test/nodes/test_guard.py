@@ -18,11 +18,11 @@ from relay_autotune.nodes import watch
 from relay_autotune.nodes.readiness import Mark, _expected, _rest_of
 from relay_autotune.nodes.relay import RelayNode
 from relay_autotune.nodes.watch import (
-    Arrival,
     FollowWatch,
     LastSamples,
     Overtime,
     Sensor,
+    arrival,
     namesake,
     second_publisher,
     second_source,
@@ -263,7 +263,7 @@ def test_a_tune_is_asked_for_once_every_other_publisher_must_be_known() -> None:
     node = SimpleNamespace(
         create_timer=lambda wait, work, clock: timers.append((wait, work)) or timer
     )
-    relay = SimpleNamespace(_arrival=Arrival(node), _request=lambda *asked: asked)
+    relay = SimpleNamespace(_arrival=arrival(node), _request=lambda *asked: asked)
     request = SimpleNamespace(amplitude=0.5, dry_run=False)
     answer = RelayNode._on_start(relay, request, None)
     answer.send(None)
