@@ -20,7 +20,11 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem, pulse
-from relay_autotune.identification.waveform.residuals import Colour, colour_cost
+from relay_autotune.identification.waveform.residuals import (
+    IMITATES_A_DRIFT,
+    Colour,
+    colour_cost,
+)
 from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Trial,
@@ -70,9 +74,6 @@ _BEFORE = frozenset(("drift", "relaxation", "past"))
 # steps to the best.
 _STEPS, _INSTANTS, _STEPS_IN_TIME = 15, 60, 4
 
-# Twice the logarithm of the prior odds against a term that can imitate a drift, for which a
-# record without one has no use: 150 to 1.
-IMITATES_A_DRIFT = 10.0
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
 # zero of a slower inverse response as a drift.
 _LASTING = 2.0

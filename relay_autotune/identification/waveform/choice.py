@@ -92,8 +92,6 @@ _CHANCE = 1e-3
 # Score beyond which a structure is hopeless beside the best one: odds of e^15. The plain ones
 # never are: gains have to hold on their models, too.
 _HOPELESS = 30.0
-# Length of the record in correlation times of the slow disturbance that is tried first.
-_SLOWEST = 10.0
 _ALIKE = 0.01
 # Gain in the score from which a response counts as one: odds of 20,000 to 1. Of 90 simulated pairs
 # of command and measurement that belong together it refused 4 whose gains were trusted, and of 90
@@ -412,7 +410,7 @@ def _likeliest_colour(context: FitContext, simulated: list[Candidate]) -> list[C
     own = _colour(simulated[0].problem, simulated[0].state)
     if own is None:
         return simulated
-    slow = slow_colour(1.0 - _SLOWEST / context.problem.time.size)
+    slow = slow_colour(context.problem.time.size)
     ends = (_converged(_in(colour, simulated, context), context) for colour in (own, slow))
     least = min(c.state.cost / c.problem.time.size for c in simulated)
     likely = [end for end in ends if end and _simulates(end[0], least)]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.special import gammaincc
@@ -118,6 +119,11 @@ def mean_slope(residual: FloatArray, scale: float, loss: str) -> float:
 _MOST_LAGS = 24
 # Least number of samples for each further lag.
 _SAMPLES_EACH = 12
+# Length of a record in correlation times of a disturbance, below which it looks like a drift.
+_SLOWEST = 10.0
+# Twice the logarithm of the prior odds against what can imitate a drift, for which a record
+# without one has no use: 150 to 1.
+IMITATES_A_DRIFT = 10.0
 # Largest correlation of neighbours that rounding can tell from 1.
 _CERTAIN = 1.0 - 1e-12
 
@@ -152,6 +158,12 @@ class Colour:
         white[..., :p] = rows[..., :p] @ self.begin[:p, :p].T
         return white
 
+    @cached_property
+    def nearest_to_1(self) -> float:
+        """Distance of the nearest pole from 1, which is that of a random walk."""
+        poles = np.roots(np.append(1.0, -self.coefficients))
+        return float(np.min(np.abs(1.0 - poles)))
+
     @property
     def log_determinant(self) -> float:
         """Logarithm of the determinant of the noise's covariance over the variance of e."""
@@ -159,19 +171,26 @@ class Colour:
 
 
 def colour_cost(colour: Colour | None, samples: int) -> float:
-    """Return what a colour adds to the Bayesian information criterion of what it whitens.
+    """Return what a colour adds to the score of what it whitens.
+
+    To the Bayesian information criterion comes the prior against a pole so near 1 that the noise
+    wanders like a drift.
 
     :param colour: None: white.
     :param samples: number of samples.
     """
-    return 0.0 if colour is None else colour.log_determinant + colour.order * math.log(samples)
+    if colour is None:
+        return 0.0
+    wanders = colour.nearest_to_1 < _SLOWEST / samples
+    return colour.log_determinant + colour.order * math.log(samples) + IMITATES_A_DRIFT * wanders
 
 
-def slow_colour(pole: float) -> Colour:
+def slow_colour(samples: int) -> Colour:
     """Return the colour of a slow disturbance, an autoregression of first order.
 
-    :param pole: just below 1.
+    :param samples: of the record, ten correlation times of it.
     """
+    pole = 1.0 - _SLOWEST / samples
     return Colour(np.array([pole]), np.array([[math.sqrt(1.0 - pole**2)]]))
 
 
