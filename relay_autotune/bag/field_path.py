@@ -22,7 +22,7 @@ import difflib
 import itertools
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from relay_autotune.errors import FieldError, visible
@@ -165,16 +165,14 @@ class Element:
     chosen: int | str
     names: Names | None
 
-    def shown(self, name: str = "NAME") -> str:
-        """Return how it is written with a name.
-
-        :param name: the name.
-        """
-        if self.names is None:
-            return f"[{self.chosen}]"
+    @property
+    def written(self) -> str:
+        """How it is written in a path."""
+        names, by = self.names, ""
         # Digits alone would be a place.
-        by = f"{self.names.field}=" if self.names.depth is None or name.isdecimal() else ""
-        return f"[{by}{name}]"
+        if names and isinstance(self.chosen, str):
+            by = f"{names.field}=" if names.depth is None or self.chosen.isdecimal() else ""
+        return f"[{by}{self.chosen}]"
 
 
 Step = str | Element
@@ -235,7 +233,7 @@ def _spelt(root: Struct, path: str) -> str:
         return path
     return written(
         [
-            Element("NAME", step.names)
+            replace(step, chosen="NAME")
             if isinstance(step, Element) and step.names and isinstance(step.chosen, int)
             else step
             for step in steps_of(root, path, "")
@@ -246,7 +244,7 @@ def _spelt(root: Struct, path: str) -> str:
 def written(steps: Sequence[Step]) -> str:
     """Return the path of some steps."""
     return "".join(
-        f".{step}" if isinstance(step, str) else _as_written(step) for step in steps
+        f".{step}" if isinstance(step, str) else step.written for step in steps
     ).removeprefix(".")
 
 
@@ -428,7 +426,7 @@ class _Finder:
             if chosen >= count:
                 raise FieldError(f"{self._shown()}: the array has length {count}")
             if by is not None and len(names) == count:
-                right = self._shown(self._element.shown(_text(names[chosen])))
+                right = self._shown(_text(names[chosen]))
                 raise FieldError(
                     f"{self._shown()}: this message names its elements; write {right}"
                 )
@@ -444,7 +442,7 @@ class _Finder:
             )
         if not where:
             near = difflib.get_close_matches(chosen, wanted, n=1)
-            meant = f"; write {self._shown(self._element.shown(near[0]))}" if near else ""
+            meant = f"; write {self._shown(near[0])}" if near else ""
             raise FieldError(
                 f"{self._shown()}: {told} has no {chosen!r}; it has {_some_of(wanted)}{meant}"
             )
@@ -454,14 +452,10 @@ class _Finder:
             )
         return where[0]
 
-    def _shown(self, last: str = "") -> str:
-        """Return the path up to the element, with something else in its place if given."""
-        return visible(written(self._steps[: self._at]) + (last or _as_written(self._element)))
-
-
-def _as_written(element: Element) -> str:
-    chosen = element.chosen
-    return element.shown(chosen) if isinstance(chosen, str) else f"[{chosen}]"
+    def _shown(self, name: str | None = None) -> str:
+        """Return the path up to the element, by another name if given."""
+        last = self._element if name is None else replace(self._element, chosen=name)
+        return visible(written([*self._steps[: self._at], last]))
 
 
 def _names(by: Names, array: Any, trail: Sequence[Any]) -> Sequence[Any]:
