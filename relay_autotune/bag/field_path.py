@@ -21,7 +21,7 @@ from __future__ import annotations
 import difflib
 import itertools
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -212,10 +212,7 @@ def steps_of(root: Struct, path: str, of: str) -> tuple[Step, ...]:
 
 def some_numbers(root: Struct) -> str:
     """Return the paths of some numbers of a type, for an error."""
-    found = list(itertools.islice(_listed(root), _LISTED + 1))
-    if not found:
-        return "no numbers"
-    return ", ".join(found[:_LISTED]) + (", ..." if len(found) > _LISTED else "")
+    return _some_of(_listed(root)) or "no numbers"
 
 
 def first_numbers(root: Struct, count: int) -> list[str]:
@@ -444,7 +441,8 @@ class _Finder:
             near = difflib.get_close_matches(chosen, wanted, n=1)
             meant = f"; write {self._shown(near[0])}" if near else ""
             raise FieldError(
-                f"{self._shown()}: {told} has no {chosen!r}; it has {_some_of(wanted)}{meant}"
+                f"{self._shown()}: {told} has no {chosen!r}; it has "
+                f"{_some_of(wanted) or 'no names'}{meant}"
             )
         if len(wanted) != count:
             raise FieldError(
@@ -469,23 +467,22 @@ def _text(name: Any) -> str:
     return name if isinstance(name, str) else str(int(name))
 
 
-def _some_of(names: Sequence[str]) -> str:
-    if not names:
-        return "no names"
-    shown = ", ".join(map(visible, names[:_LISTED]))
-    return shown + (", ..." if len(names) > _LISTED else "")
+def _some_of(names: Iterable[str]) -> str:
+    found = list(itertools.islice(names, _LISTED + 1))
+    return ", ".join(map(visible, found[:_LISTED])) + ", ..." * (len(found) > _LISTED)
 
 
-# Units that the definitions of messages say, by their type and the beginning of a field's path.
-_UNITS = {
-    ("sensor_msgs/msg/Temperature", "temperature"): "°C",
-    ("sensor_msgs/msg/FluidPressure", "fluid_pressure"): "Pa",
-    ("sensor_msgs/msg/Illuminance", "illuminance"): "lx",
-    ("sensor_msgs/msg/Range", "range"): "m",
-    ("sensor_msgs/msg/BatteryState", "voltage"): "V",
-    ("sensor_msgs/msg/Imu", "angular_velocity"): "rad/s",
-    ("geometry_msgs/msg/Twist", "linear"): "m/s",
-    ("geometry_msgs/msg/Twist", "angular"): "rad/s",
+# Units that the definitions of messages say, by type and field; a number among these fields is
+# what a message of several numbers is about.
+UNITS = {
+    "sensor_msgs/msg/Temperature": {"temperature": "°C"},
+    "sensor_msgs/msg/FluidPressure": {"fluid_pressure": "Pa"},
+    "sensor_msgs/msg/RelativeHumidity": {"relative_humidity": ""},
+    "sensor_msgs/msg/Illuminance": {"illuminance": "lx"},
+    "sensor_msgs/msg/Range": {"range": "m"},
+    "sensor_msgs/msg/BatteryState": {"voltage": "V"},
+    "sensor_msgs/msg/Imu": {"angular_velocity": "rad/s"},
+    "geometry_msgs/msg/Twist": {"linear": "m/s", "angular": "rad/s"},
 }
 
 
@@ -495,4 +492,4 @@ def unit_of_field(type_name: str, field: str) -> str:
     :param type_name: such as ``sensor_msgs/msg/Temperature``.
     :param field: path of the number in it.
     """
-    return _UNITS.get((type_name, field.partition(".")[0]), "")
+    return UNITS.get(type_name, {}).get(field.partition(".")[0], "")

@@ -23,6 +23,8 @@ from relay_autotune.bag.bag_file import BagFile
 from relay_autotune.bag.cdr import Path, decode_messages, decoded_message
 from relay_autotune.bag.definitions import message_type
 from relay_autotune.bag.field_path import (
+    UNITS,
+    Number,
     Struct,
     Type,
     first_numbers,
@@ -332,16 +334,6 @@ def _stamps(stamp: tuple[Path, Path], messages: Messages) -> tuple[IntArray, NDA
     return np.maximum(times, 0), good & also
 
 
-# The field that a message of several numbers is about.
-_MEANT = {
-    "sensor_msgs/msg/Temperature": "temperature",
-    "sensor_msgs/msg/FluidPressure": "fluid_pressure",
-    "sensor_msgs/msg/RelativeHumidity": "relative_humidity",
-    "sensor_msgs/msg/Illuminance": "illuminance",
-    "sensor_msgs/msg/Range": "range",
-    "sensor_msgs/msg/BatteryState": "voltage",
-}
-
 _FIELDS_OF_SINGLE = 2
 
 
@@ -377,9 +369,9 @@ def named_field(root: Struct, field: str, topic: str) -> Path:
 
 def only_field(root: Struct) -> str | None:
     """Return the number that a message is about; None if it may be any of several."""
-    if root.name in _MEANT:
-        return _MEANT[root.name]
-    found = first_numbers(root, 2)
+    told = UNITS.get(root.name, {})
+    meant = [name for name, kind in root.fields if name in told and isinstance(kind, Number)]
+    found = meant or first_numbers(root, 2)
     return found[0] if len(found) == 1 and "[" not in found[0] else None
 
 
@@ -388,7 +380,7 @@ def may_be_single(channel: Channel) -> bool:
 
     A robot's bag holds hundreds of types; to parse all of them takes seconds.
     """
-    if channel.type in _MEANT or channel.schema_encoding != "ros2msg":
+    if channel.type in UNITS or channel.schema_encoding != "ros2msg":
         return True
     own = channel.definition.split(b"\n===", 1)[0]
     lines = (line.split(b"#", 1)[0].strip() for line in own.splitlines())
