@@ -70,16 +70,14 @@ class Path:
         if begin.size == 0:
             return np.empty(0), np.empty(0, dtype=np.bool_)
         fits = end - begin >= _ENCAPSULATION
-        all_fit = bool(fits.all())
         # A message shorter than that may lie at the very end.
-        kinds = values_at(content, "<u2", begin if all_fit else np.where(fits, begin, 0))
-        little = kinds == 0x0100
-        if all_fit and bool(little.all()):
-            return self._of_one_order(content, begin, end, "<")
+        kinds = values_at(content, "<u2", begin if fits.all() else np.where(fits, begin, 0))
         values = np.zeros(begin.size)
         good = np.zeros(begin.size, dtype=np.bool_)
-        for order, chosen in (("<", little & fits), (">", (kinds == 0x0000) & fits)):
-            at = np.flatnonzero(chosen)
+        for order, kind in (("<", 0x0100), (">", 0x0000)):
+            at = np.flatnonzero((kinds == kind) & fits)
+            if at.size == begin.size:
+                return self._of_one_order(content, begin, end, order)
             if at.size:
                 values[at], good[at] = self._of_one_order(content, begin[at], end[at], order)
         return values, good
@@ -367,75 +365,72 @@ def decode_messages(
             f"{channel.topic} is encoded as {channel.encoding!r} with a definition in "
             f"{channel.schema_encoding!r}; expected 'cdr' with 'ros2msg'"
         )
-    root = message_type(channel)
-    budget = _Budget()
-    return [
-        _with_defaults(decoded_message(root, data, f" of {channel.topic}", budget), defaults)
-        for data in payload
-    ]
+    decoder = _Decoder(message_type(channel), f" of {channel.topic}")
+    return [_with_defaults(decoder.decoded(data), defaults) for data in payload]
 
 
-def decoded_message(root: Struct, data: bytes, of: str = "", budget: _Budget | None = None) -> Any:
-    """Decode one message of any type; bytes after its end are allowed.
-
-    ROS 2's own serialization leaves some there: it makes room for the alignment of a sequence's
-    elements even if the sequence is empty.
+def decoded_message(root: Struct, data: bytes) -> Any:
+    """Decode one message of any type.
 
     :param root: its type.
     :param data: the serialized message.
-    :param of: what to say of it in an error.
-    :param budget: of the structures and elements; default: one of its own.
     :return: an object with the fields as attributes.
     :raises BagError: if it does not fit its type.
     """
-    try:
-        if data[:2] not in (b"\x00\x00", b"\x00\x01") or len(data) < _ENCAPSULATION:
-            raise ValueError("it is not in plain CDR")
-        order, body = "<" if data[1] else ">", memoryview(data)[_ENCAPSULATION:]
-        return _Decoder(body, order, budget or _Budget()).take(root)
-    except (ValueError, struct.error, MemoryError) as error:
-        raise BagError(f"a message{of} does not fit its definition: {first_line(error)}") from None
-
-
-class _Budget:
-    """Limits the number of structures and elements, each of which takes memory."""
-
-    def __init__(self) -> None:
-        self._left = MOST_ELEMENTS
-
-    def take(self, count: int) -> None:
-        """Take a number of structures or elements.
-
-        :raises ValueError: if there are too many.
-        """
-        self._left -= count
-        if self._left < 0:
-            raise ValueError(f"more than {MOST_ELEMENTS} structures and elements of lists")
+    return _Decoder(root).decoded(data)
 
 
 class _Decoder:
-    """Takes one value after another out of a message in plain CDR, see `cdr`."""
+    """Decodes messages of a type, with a limit on the structures and elements in all of them.
 
-    def __init__(self, data: memoryview, order: str, budget: _Budget) -> None:
-        self._data = data
-        self._order = order
-        self._budget = budget
-        self._at = 0
+    :param root: the type.
+    :param of: what to say of a message in an error.
+    """
 
-    def take(self, kind: Type) -> Any:
+    def __init__(self, root: Struct, of: str = "") -> None:
+        self._root, self._of = root, of
+        self._left = MOST_ELEMENTS
+
+    def decoded(self, data: bytes) -> Any:
+        """Return a message in plain CDR as an object; bytes after its end are allowed.
+
+        ROS 2's own serialization leaves some there: it makes room for the alignment of a
+        sequence's elements even if the sequence is empty.
+
+        :param data: the serialized message.
+        :raises BagError: if it does not fit its type.
+        """
+        try:
+            if data[:2] not in (b"\x00\x00", b"\x00\x01") or len(data) < _ENCAPSULATION:
+                raise ValueError("it is not in plain CDR")
+            self._order, self._at = "<" if data[1] else ">", 0
+            self._data = memoryview(data)[_ENCAPSULATION:]
+            return self._take(self._root)
+        except (ValueError, struct.error, MemoryError) as error:
+            raise BagError(
+                f"a message{self._of} does not fit its definition: {first_line(error)}"
+            ) from None
+
+    def _count(self, number: int) -> None:
+        """Count structures or elements, each of which takes memory."""
+        self._left -= number
+        if self._left < 0:
+            raise ValueError(f"more than {MOST_ELEMENTS} structures and elements of lists")
+
+    def _take(self, kind: Type) -> Any:
         """Return the next value: a number, a text, an array, a list, or an object with fields."""
         if isinstance(kind, Number):
             return self._number(kind)
         if isinstance(kind, Text):
             return self._text(kind)
         if isinstance(kind, Struct):
-            self._budget.take(1)
-            return SimpleNamespace(**{name: self.take(inner) for name, inner in kind.fields})
+            self._count(1)
+            return SimpleNamespace(**{name: self._take(inner) for name, inner in kind.fields})
         count = self._number(_UINT32) if kind.count is None else kind.count
         if isinstance(kind.item, Number):
             return self._array(kind.item, count)
-        self._budget.take(count)
-        return [self.take(kind.item) for _ in range(count)]
+        self._count(count)
+        return [self._take(kind.item) for _ in range(count)]
 
     def _number(self, kind: Number) -> Any:
         self._align(kind.size)
