@@ -203,18 +203,16 @@ class Source:
 
     def _expand(self) -> None:
         """Expand a file that is compressed as a whole into a temporary file."""
-        compressed = os.fstat(self._file.fileno()).st_size
-        most = max(UNSUSPICIOUS, MOST_EXPANSION * compressed)
-        # close() closes it, which deletes it.
-        expanded = tempfile.TemporaryFile(prefix="relay_autotune_")  # noqa: SIM115
+        most = max(UNSUSPICIOUS, MOST_EXPANSION * os.fstat(self._file.fileno()).st_size)
         try:
-            room = shutil.disk_usage(tempfile.gettempdir()).free - FREE_DISK
-            self._file.seek(0)
-            written = 0
-            try:
+            with self._file as compressed:
+                # close() closes it, which deletes it.
+                self._file = tempfile.TemporaryFile(prefix="relay_autotune_")  # noqa: SIM115
+                room = shutil.disk_usage(tempfile.gettempdir()).free - FREE_DISK
+                written = 0
                 with expanding("zstandard") as zstandard:
                     decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
-                    stream = decompressor.stream_reader(self._file, closefd=False)
+                    stream = decompressor.stream_reader(compressed)
                     while piece := stream.read(1 << 20):
                         written += len(piece)
                         if written > most:
@@ -227,21 +225,15 @@ class Source:
                                 f"{self.path} expands to more than the {max(room, 0)} bytes that "
                                 f"are free in {tempfile.gettempdir()}; set TMPDIR to a larger disk"
                             )
-                        expanded.write(piece)
-                if not written:
-                    self.notes.append(f"{self.path.name} ends before anything can be expanded")
-            except DamageError as damage:
-                # What came before is a recording that ends there.
-                self.notes.append(f"{self.path.name} cannot be expanded to its end ({damage})")
-            expanded.flush()
+                        self._file.write(piece)
+                        self._file.flush()
+            if not written:
+                self.notes.append(f"{self.path.name} ends before anything can be expanded")
+        except DamageError as damage:
+            # What came before is a recording that ends there.
+            self.notes.append(f"{self.path.name} cannot be expanded to its end ({damage})")
         except OSError as error:
-            expanded.close()
             raise BagError(f"cannot expand {self.path}: {error.strerror or error}") from error
-        except BaseException:
-            expanded.close()
-            raise
-        self._file.close()
-        self._file = expanded
 
 
 def file_records(source: Source, position: int, stop: int) -> Iterator[tuple[int, int, int]]:
