@@ -75,18 +75,20 @@ class BagFile:
     """A file of a bag, open for reading.
 
     :param path: the file; it may be compressed as a whole with zstd.
-    :param largest: size that a message may have [bytes].
-    :param magic: the bytes with which it has to begin.
-    :raises BagError: if it is missing, unreadable or something else.
+    :param largest_chunk: size that a chunk, or a message, may have [bytes].
+    :raises BagError: if it is missing, unreadable, empty or something else.
     """
 
-    def __init__(self, path: Path, largest: int, magic: bytes = MAGIC) -> None:
+    _magic = MAGIC
+    """The bytes with which it has to begin."""
+
+    def __init__(self, path: Path, largest_chunk: int = LARGEST_CHUNK) -> None:
         self.path = path
         self.channels: dict[int, Channel] = {}
         self.metadata: list[tuple[str, dict[str, str]]] = []
         self.message_counts: dict[int, int] = {}
         """How many messages of each channel the file says it has, where it says so."""
-        self._source = Source(path, magic, largest)
+        self._source = Source(path, self._magic, largest_chunk)
         self.notes = [*self._source.notes]
         self._refused: set[int] = set()
         try:
@@ -230,15 +232,7 @@ def _listed_together(pieces: Sequence[_Piece], begins: IntArray) -> dict[int, In
 
 
 class McapFile(BagFile):
-    """An MCAP file open for reading.
-
-    :param path: the file.
-    :param largest_chunk: size that a chunk may have [bytes]; one that declares more is left out.
-    :raises BagError: if it is missing, empty, too short or not MCAP.
-    """
-
-    def __init__(self, path: Path, largest_chunk: int = LARGEST_CHUNK) -> None:
-        super().__init__(path, largest_chunk)
+    """An MCAP file open for reading; a chunk that declares more than is allowed is left out."""
 
     def _open(self) -> None:
         self._layout = layout = layout_by_summary(self._source) or scan(self._source)
@@ -425,16 +419,11 @@ class SqliteFile(BagFile):
     """A ``.db3`` file of rosbag2 open for reading.
 
     It holds definitions of types since Iron; for an older one, those of the installed packages
-    count.
-
-    :param path: the file; it may be compressed as a whole with zstd.
-    :param largest: size that a message may have [bytes]; a larger one ends the reading.
-    :raises BagError: if it is missing, unreadable or no such file.
+    count. A message that is larger than allowed ends the reading.
     """
 
-    def __init__(self, path: Path, largest: int = LARGEST_CHUNK) -> None:
-        self._steps = 0
-        super().__init__(path, largest, SQLITE_MAGIC)
+    _magic = SQLITE_MAGIC
+    _steps = 0
 
     def _open(self) -> None:
         if self.path.with_name(self.path.name + "-wal").exists():

@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from relay_autotune.bag.bag_file import BagFile, McapFile
+from relay_autotune.bag.bag_file import BagFile, McapFile, SqliteFile
 from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.signals import CLOCKS, Signal
 from relay_autotune.bag.source import known_start, open_regular
@@ -144,12 +144,8 @@ def _named_so(path: Path) -> bool:
 
 
 def _opened(path: Path, largest: int) -> BagFile:
-    if ".db3" in path.suffixes[-2:]:
-        # Imported here: most recordings need no database.
-        from relay_autotune.bag.bag_file import SqliteFile
-
-        return SqliteFile(path, largest)
-    return McapFile(path, largest)
+    kind = SqliteFile if ".db3" in path.suffixes[-2:] else McapFile
+    return kind(path, largest)
 
 
 def _data_files(path: Path) -> list[Path]:
