@@ -14,7 +14,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -194,8 +194,7 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
     logs = []
     for first, last in pairwise(bounds):
         part = slice(first, last)
-        log = _log(names, time_ns[part], values[:, part], dated, notes)
-        logs.append(replace(log, units=units))
+        logs.append(_log(names, time_ns[part], values[:, part], dated, units, notes))
         notes = []
     return tuple(logs)
 
@@ -205,6 +204,7 @@ def _log(
     time_ns: IntArray,
     values: FloatArray,
     dated: bool,
+    units: Mapping[str, str],
     notes: list[str],
 ) -> Log:
     """Return one recording, its rows in the order of their time.
@@ -243,7 +243,7 @@ def _log(
                 f"the longest gap is {gap / 1e9:.6g} s"
             )
         signals.append(Signal(name, time_ns[there], ordered[there]))
-    return Log(signals[0], signals[1], dated, {}, tuple(notes))
+    return Log(signals[0], signals[1], dated, units, tuple(notes))
 
 
 def _spread(time_ns: IntArray) -> tuple[IntArray, float]:
