@@ -42,8 +42,8 @@ from relay_autotune.identification.result import Identification
 from relay_autotune.process.structures import FOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import NORMAL_95, Quantity, declared
-from relay_autotune.record.cycles import cycles_of, limit_cycle
-from relay_autotune.record.record import Cycle, Outcome, Record, one_record
+from relay_autotune.record.cycles import limit_cycle
+from relay_autotune.record.record import Outcome, Record, one_record
 from relay_autotune.record.thinning import thinned
 from relay_autotune.result import Analysis, Shaping
 from relay_autotune.text import digits
@@ -151,9 +151,9 @@ def analyse(
     if alone:
         simple = chosen.simple(known, rules)
     tell("judging the model")
-    record, cycles = chosen.record, chosen.cycles
-    found = Analysis(record, cycles, assess(models, record), 0)
-    settled = bool(cycles) and limit_cycle(cycles).converged
+    record = chosen.record
+    found = Analysis(record, assess(models, record), 0)
+    settled = bool(found.cycles) and limit_cycle(found.cycles).converged
     return _judged(found, (record,), task, rules, simple, rng, tell, settled=settled)
 
 
@@ -172,9 +172,8 @@ def model_so_far(record: Record, task: Task | None = None, *, predicts: bool = F
         return chosen
     if not predicts:
         return chosen.alone
-    of = chosen.model, chosen.record, chosen.cycles
     simple = chosen.simple(task.known, (task.rule,))
-    designed = task_of_record(*of, task.options, simple)
+    designed = task_of_record(chosen.model, chosen.record, task.options, simple)
     predicted = predicted_ms(designed, rule_named(task.rule))
     return replace(chosen.alone, predicted=predicted)
 
@@ -220,14 +219,12 @@ class _Chosen:
     """The selected model.
 
     :param records: what was identified; the first represents all.
-    :param cycles: its whole cycles.
     :param model: the identification, without the fit of the FOPDT, which holds many times the
         memory of the record.
     :param plain: of the identification.
     """
 
     records: Sequence[Record]
-    cycles: tuple[Cycle, ...]
     model: Identification
     plain: Callable[[], Identification | None] | None
 
@@ -239,7 +236,7 @@ class _Chosen:
     @property
     def alone(self) -> Analysis:
         """The analysis with this model only."""
-        return Analysis(self.record, self.cycles, (self.model,), 0)
+        return Analysis(self.record, (self.model,), 0)
 
     def fopdt(self, known: Known) -> Identification | None:
         """Return the best FOPDT by the default method; None: there is none.
@@ -286,18 +283,16 @@ def _identified(
     :return: without a model, the analysis with the reason.
     """
     first = records[0]
-    cycles: tuple[Cycle, ...] = ()
     try:
         for record in records:
             sampling_period(record)
-        cycles = cycles_of(first)
         found = fit()
     except RelayAutotuneError as error:
         reason = _with_outcome(first, str(error))
-        return Analysis(first, cycles, reason=reason, judgement=Judgement(refused=reason))
+        return Analysis(first, reason=reason, judgement=Judgement(refused=reason))
     said = [record.unthinned.remark for record in records if record.unthinned is not None]
     model = replace(found, plain=None, warnings=(*found.warnings, *said))
-    return _Chosen(records, cycles, model, found.plain)
+    return _Chosen(records, model, found.plain)
 
 
 def _chosen_so_far(record: Record, task: Task) -> _Chosen | Analysis:
@@ -348,7 +343,7 @@ def analyse_jointly(
     told = unequal_amplitudes(records, chosen.model)
     if told:
         chosen = replace(chosen, warnings=(*chosen.warnings, told))
-    found = Analysis(first, joint.cycles, assess((chosen,), first), 0)
+    found = Analysis(first, assess((chosen,), first), 0)
     rules = _first(rule)
     return _judged(found, records, task, rules, joint.simple(known, rules), rng)
 
@@ -387,7 +382,7 @@ def _judged(
         return _without_gains(found, judgement)
     tell("designing the gains")
     record, options = found.record, asked.options
-    task = task_of_record(chosen, record, found.cycles, options, simple, rng, beside)
+    task = task_of_record(chosen, record, options, simple, rng, beside)
     shaping = Shaping(task, evidence, findings)
     chosen = warned_of_rows(chosen, record, options)
     found = replace(found, models=(chosen, *others), shaping=shaping)

@@ -21,6 +21,7 @@ from relay_autotune.identification.result import Identification
 from relay_autotune.loop.gains import Gains
 from relay_autotune.process.transfer_function import process_mathml, process_text
 from relay_autotune.quantities import NORMAL_95
+from relay_autotune.record.cycles import cycles_of
 from relay_autotune.record.record import Cycle, Record
 from relay_autotune.text import digits, in_units, plus_minus
 from relay_autotune.tuning.ensemble import PredictedMs, ms_on_each
@@ -90,7 +91,6 @@ class Analysis:
     ('TRUSTED', 'robust', True)
 
     :param record: the record.
-    :param cycles: its whole cycles.
     :param models: the models of all methods that apply, the chosen method's first.
     :param selected: index of the selected model; None: nothing was identified.
     :param gains: the gains of all rules that apply to that model, the chosen rule's first.
@@ -105,7 +105,6 @@ class Analysis:
     """
 
     record: Record
-    cycles: tuple[Cycle, ...] = ()
     models: tuple[Identification, ...] = ()
     selected: int | None = None
     gains: tuple[Gains, ...] = ()
@@ -115,6 +114,11 @@ class Analysis:
     judgement: Judgement = NOT_JUDGED
     predicted: PredictedMs | None = None
     shaping: Shaping | None = None
+
+    @property
+    def cycles(self) -> tuple[Cycle, ...]:
+        """The whole cycles of the record."""
+        return cycles_of(self.record)
 
     @property
     def model(self) -> Identification | None:

@@ -82,7 +82,6 @@ class Case:
     :param lost_samples: number of samples that were sent and not received.
     :param record: the samples; None: not known.
     :param settings: of the relay; None: no relay, or not known.
-    :param cycles: the whole cycles; empty where there are no samples.
     :param models_around: models within the uncertainty of the selected one.
     :param added_delay: dead time that the controller's loop adds to the process [s].
     :param judgement: what the checks found, and the verdict.
@@ -108,7 +107,6 @@ class Case:
     lost_samples: int = 0
     record: Record | None = None
     settings: RelaySettings | None = None
-    cycles: tuple[Cycle, ...] = ()
     models_around: tuple[TransferFunction, ...] = ()
     added_delay: float = 0.0
     judgement: Judgement = NOT_JUDGED
@@ -117,6 +115,11 @@ class Case:
     units: Mapping[str, str] = field(default_factory=dict)
     command: str = ""
     truth: TransferFunction | None = None
+
+    @property
+    def cycles(self) -> tuple[Cycle, ...]:
+        """The whole cycles; empty where there are no samples."""
+        return () if self.record is None else cycles_of(self.record)
 
     @property
     def model(self) -> Identification | None:
@@ -180,19 +183,11 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
         lost_samples=record.lost_samples,
         record=record,
         settings=settings_of(record),
-        cycles=analysis.cycles or _cycles(record),
         models_around=models,
         added_delay=analysis.added_delay,
         judgement=analysis.judgement,
         units=record.units,
     )
-
-
-def _cycles(record: Record) -> tuple[Cycle, ...]:
-    try:
-        return cycles_of(record)
-    except RelayAutotuneError:
-        return ()
 
 
 def around(model: Identification | None) -> tuple[TransferFunction, ...]:

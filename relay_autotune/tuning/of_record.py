@@ -17,8 +17,8 @@ from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.posterior import DRAWS
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import LONGEST, SHORTEST
-from relay_autotune.record.cycles import limit_cycle
-from relay_autotune.record.record import Cycle, Record
+from relay_autotune.record.cycles import cycles_of, limit_cycle
+from relay_autotune.record.record import Record
 from relay_autotune.text import digits
 from relay_autotune.tuning.ensemble import ensemble
 from relay_autotune.tuning.rules.formulas import describing_point_of_cycle
@@ -28,7 +28,6 @@ from relay_autotune.tuning.task import DesignOptions, DesignTask
 def task_of_record(
     chosen: Identification,
     record: Record,
-    cycles: Sequence[Cycle],
     options: DesignOptions,
     simple: TransferFunction | None,
     rng: np.random.Generator | None = None,
@@ -38,7 +37,6 @@ def task_of_record(
 
     :param chosen: that model.
     :param record: the record.
-    :param cycles: its whole cycles.
     :param options: as they were given.
     :param simple: the FOPDT that most rules need; None: there is none.
     :param rng: draws the models within the uncertainty; None: of a fixed seed.
@@ -54,8 +52,8 @@ def task_of_record(
         options = replace(options, loop_delay=options.loop_delay + 0.5 * unseen)
         models = _spread_in_time(models, unseen, rng)
     describing, settings = None, record.settings
-    if cycles and settings is not None:
-        average, sign = limit_cycle(cycles), chosen.model.process_sign
+    if settings is not None and cycles_of(record):
+        average, sign = limit_cycle(record), chosen.model.process_sign
         describing = describing_point_of_cycle(average, settings.amplitude, sign)
     return DesignTask(
         model=chosen.model,

@@ -55,7 +55,7 @@ def test_a_doubt_marks_the_gains_in_table_document_page_and_message(monkeypatch)
     case = case_of(found, "tank")
     assert verdict_of(case).text.startswith("doubtful gains")
     assert checks_of(case)[-1].mark == "!"
-    assert said in page([replace(case, record=None, cycles=(), models_around=())])
+    assert said in page([replace(case, record=None, models_around=())])
     message = SimpleNamespace(
         header=SimpleNamespace(stamp=SimpleNamespace()), verdict_why=SimpleNamespace()
     )
@@ -86,7 +86,7 @@ def test_it_is_said_why_a_rival_of_more_support_is_not_taken(monkeypatch):
         shown = replace(found, models=(chosen, *others))
         said = "the simplest structure that the record does not refute is taken, with 13 % of"
         assert (said in " ".join(table("tank", [shown]).split())) == told
-        case = replace(case_of(shown, "tank"), record=None, cycles=(), models_around=())
+        case = replace(case_of(shown, "tank"), record=None, models_around=())
         assert (said.capitalize() in page([case])) == told
 
 

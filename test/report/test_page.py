@@ -183,7 +183,7 @@ def test_names_and_reasons_from_a_bag_are_text_and_never_html() -> None:
         combinations=(Combination(HOSTILE, HOSTILE, 1.0, 0.1, 0.8, 1.2),),
     )
     case = case_of(replace(hostile, models=(model, *hostile.models[1:])), HOSTILE)
-    text = page([replace(case, record=None, cycles=(), models_around=())], title=HOSTILE)
+    text = page([replace(case, record=None, models_around=())], title=HOSTILE)
     found = read(text)
     assert found.elements.count("script") == 1
     assert "img" not in found.elements
@@ -198,7 +198,7 @@ def test_what_does_not_shake_the_verdict_does_not_head_the_page(
     only(monkeypatch)
     found = completed()
     models = (replace(found.models[0], warnings=("a load step of -0.211 u",)), *found.models[1:])
-    case = replace(case_of(replace(found, models=models), "tank"), record=None, cycles=())
+    case = replace(case_of(replace(found, models=models), "tank"), record=None)
     monkeypatch.setattr(type(case.judgement), "verdict", verdict)
     heads, remarks = warnings_of(case), remarks_of(case)
     assert ("a load step of -0.211 u" in remarks) is (verdict is Verdict.TRUSTED)
@@ -207,7 +207,7 @@ def test_what_does_not_shake_the_verdict_does_not_head_the_page(
 
 
 def test_without_gains_the_reason_stands_in_their_place() -> None:
-    case = replace(case_of(aborted(), "tank"), record=None, cycles=(), models_around=())
+    case = replace(case_of(aborted(), "tank"), record=None, models_around=())
     found = read(page([case]))
     assert "No gains" in found.text
     assert "the operator pressed the button" in found.text

@@ -36,6 +36,4 @@ def aborted(reason: str = "the operator pressed the button") -> Analysis:
 
 def fruitless(reason: str = "found no response to the command") -> Analysis:
     """Return an experiment without a model."""
-    return Analysis(
-        completed().record, completed().cycles, reason=reason, judgement=Judgement(refused=reason)
-    )
+    return Analysis(completed().record, reason=reason, judgement=Judgement(refused=reason))
