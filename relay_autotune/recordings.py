@@ -344,7 +344,7 @@ def _rebuilt(topics: Topics, about: Mapping[str, str]) -> Record:
     # Here each sample is followed by its answer, before the next one; the last may be missing.
     answer = np.searchsorted(answers.order, samples.order)
     following = np.append(samples.order[1:], np.iinfo(np.int64).max)
-    answered = answer < len(answers)
+    answered = answer < answers.order.size
     answered[answered] = answers.order[answer[answered]] < following[answered]
     if not bool(np.any(answered)):
         raise BagError(f"{topics.path} ends before the first sample of its experiment")

@@ -141,7 +141,7 @@ class BagFile:
         :raises BagError: if they expand to more than a recording does.
         """
         # The first of them tells whether they are compressed.
-        if not (len(messages) and messages.payload(0, len(ZSTD_MAGIC)) == ZSTD_MAGIC):
+        if messages.payload(0, len(ZSTD_MAGIC)) != ZSTD_MAGIC:
             yield messages
             return
         with expanding("zstandard") as zstandard:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from relay_autotune.bag.arrays import IntArray
 from relay_autotune.bag.definitions import first_line, message_type
 from relay_autotune.bag.field_path import (
+    NUMBERS,
     Element,
     Number,
     Repeated,
@@ -38,7 +39,7 @@ from relay_autotune.bag.mcap_records import Channel, Content, values_at
 from relay_autotune.errors import BagError, FieldError, visible
 
 _ENCAPSULATION = 4
-_UINT32 = Number("uint32", "u4")
+_UINT32 = NUMBERS["uint32"]
 _EVERY_MESSAGE = np.ones(1, dtype=np.bool_)
 
 Place = int | IntArray
@@ -62,13 +63,11 @@ class Path:
         """Return the number in each of some messages, and which messages have it.
 
         :param content: bytes with the messages.
-        :param begin: where each begins, shape (n,).
+        :param begin: where each begins, shape (n,), n >= 1.
         :param end: where it ends, shape (n,).
         :return: the numbers in their own type, shape (n,); a mask of those that are there.
         :raises FieldError: if the names in a message do not tell which element is meant.
         """
-        if begin.size == 0:
-            return np.empty(0), np.empty(0, dtype=np.bool_)
         fits = end - begin >= _ENCAPSULATION
         # A message shorter than that may lie at the very end.
         kinds = values_at(content, "<u2", begin if fits.all() else np.where(fits, begin, 0))

@@ -23,7 +23,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from relay_autotune.bag.field_path import Fields, Repeated, Struct, Text, Type, number_named
+from relay_autotune.bag.field_path import NUMBERS, Fields, Repeated, Struct, Text, Type
 from relay_autotune.bag.limits import DEEPEST_TYPE, LARGEST_DEFINITION, MOST_FIELDS
 from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.errors import BagError, visible
@@ -126,7 +126,7 @@ class _Parser:
                 fields += self._declared(scope)
             self._found[name] = tuple(fields)
         elif what == "enum":
-            self._named[name] = number_named("uint32")
+            self._named[name] = NUMBERS["uint32"]
             self._take("{")
             while self._take() != "}":
                 pass
@@ -204,9 +204,9 @@ class _Parser:
             word = " ".join(words)
             if word not in _NUMBERS:
                 raise ValueError(f"{word!r} is not a type")
-            return number_named(_NUMBERS[word])
+            return NUMBERS[_NUMBERS[word]]
         if word in _NUMBERS:
-            return number_named(_NUMBERS[self._take()])
+            return NUMBERS[_NUMBERS[self._take()]]
         name = self._scoped()
         full = self._resolved(name, scope, self._named)
         if full in self._named:
@@ -238,7 +238,6 @@ _IDL_DIRECTIVE = re.compile(r"^\s*#.*$", re.MULTILINE)
 _LINE = re.compile(
     r"([A-Za-z][\w/]*)(?:<=\d+)?(?:\[((?:<=)?\d+)?(\]))?[ \t]+([A-Za-z]\w*)(?:[ \t]*(=|#)|[ \t]|$)"
 )
-_PRIMITIVE = re.compile(r"bool|byte|char|float(32|64)|u?int(8|16|32|64)")
 
 # Names of their own, from the time of ROS 1.
 _SHORT = {
@@ -246,7 +245,7 @@ _SHORT = {
     "duration": "builtin_interfaces/msg/Duration",
     "Header": "std_msgs/msg/Header",
 }
-_STAMP = (("sec", number_named("int32")), ("nanosec", number_named("uint32")))
+_STAMP = (("sec", NUMBERS["int32"]), ("nanosec", NUMBERS["uint32"]))
 _TIME = Struct("builtin_interfaces/msg/Time", _STAMP)
 # Types that a definition may leave out.
 _KNOWN = {
@@ -255,7 +254,7 @@ _KNOWN = {
     "std_msgs/msg/Header": Struct("std_msgs/msg/Header", (("stamp", _TIME), ("frame_id", Text()))),
 }
 # A structure without fields takes a byte.
-_NO_FIELDS: Fields = (("structure_needs_at_least_one_member", number_named("uint8")),)
+_NO_FIELDS: Fields = (("structure_needs_at_least_one_member", NUMBERS["uint8"]),)
 
 # Known without any installed package, so that a CSV becomes a bag on a machine without ROS.
 _BUILT_IN = {
@@ -422,8 +421,7 @@ def _fields(text: str, owner: str) -> Fields:
         if word in ("string", "wstring"):
             kind = Text(wide=word == "wstring")
         else:
-            primitive = _PRIMITIVE.fullmatch(word)
-            kind = number_named(word) if primitive else Struct(_full(word, owner))
+            kind = NUMBERS.get(word) or Struct(_full(word, owner))
         if array:
             kind = Repeated(kind, int(count) if count and count[0] != "<" else None)
         fields.append((name, kind))

@@ -27,13 +27,6 @@ from typing import Any
 
 from relay_autotune.errors import FieldError, visible
 
-_FORMS = {
-    **dict.fromkeys(("bool", "byte", "octet", "char"), "u1"),
-    **{f"{'u' * (k == 'u')}int{8 * n}": f"{k}{n}" for k in "iu" for n in (1, 2, 4, 8)},
-    "float32": "f4",
-    "float64": "f8",
-}
-
 
 @dataclass(frozen=True)
 class Number:
@@ -87,9 +80,14 @@ Type = Number | Text | Struct | Repeated
 Fields = tuple[tuple[str, Type], ...]
 
 
-def number_named(name: str) -> Number:
-    """Return the number that ROS calls so, such as ``float64``."""
-    return Number(name, _FORMS[name])
+_FORMS = {
+    **dict.fromkeys(("bool", "byte", "octet", "char"), "u1"),
+    **{f"{'u' * (k == 'u')}int{8 * n}": f"{k}{n}" for k in "iu" for n in (1, 2, 4, 8)},
+    "float32": "f4",
+    "float64": "f8",
+}
+# The numbers by the names that ROS has for them.
+NUMBERS = {name: Number(name, form) for name, form in _FORMS.items()}
 
 
 def numeric_paths(root: Type, without: tuple[str, ...] = ()) -> Iterator[str]:

@@ -171,8 +171,6 @@ class Source:
         :param ranges: where each begins and ends; of a long one the beginning is announced, the
             rest is then read ahead by itself.
         """
-        if not hasattr(os, "posix_fadvise"):
-            return
         for start, end in ranges:
             length = min(end - start, _ANNOUNCED)
             # A file system that takes no advice can be read all the same.

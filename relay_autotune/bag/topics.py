@@ -56,9 +56,6 @@ class Columns:
     publish_time: IntArray
     values: FloatArray
 
-    def __len__(self) -> int:
-        return int(self.values.size)
-
 
 # Topics that a message lists: a robot's bag has some hundred.
 _MOST_LISTED = 1000
@@ -273,7 +270,7 @@ class Topics:
             last = before
             if channels:
                 for channel, position, messages in file.read(channels):
-                    last = max(last, before + position + int(messages.order.max(initial=0)) + 1)
+                    last = max(last, before + position + int(messages.order.max()) + 1)
                     yield (number, channel), before + position, messages
                     if self.progress is not None:
                         self.progress(done + min(position, file.size), total)

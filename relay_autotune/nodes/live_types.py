@@ -18,13 +18,13 @@ from rosidl_parser import definition
 
 from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.bag.field_path import (
+    NUMBERS,
     Number,
     Repeated,
     Step,
     Struct,
     Text,
     Type,
-    number_named,
     reading,
     setting,
     steps_of,
@@ -123,7 +123,7 @@ def _type_of(slot: Any) -> Type:
         return Repeated(_type_of(slot.value_type), count)
     if isinstance(slot, definition.AbstractGenericString):
         return Text(wide=isinstance(slot, definition.AbstractWString))
-    return number_named(_PLAIN.get(slot.typename, slot.typename))
+    return NUMBERS[_PLAIN.get(slot.typename, slot.typename)]
 
 
 def _header_stamp(message: Any) -> int:
