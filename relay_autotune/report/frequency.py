@@ -45,8 +45,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
     from matplotlib.path import Path
 
-    from relay_autotune.loop.gains import Gains
-
 
 # 95 % of a normal distribution in the plane lie within this number of standard deviations.
 _ELLIPSE = math.sqrt(-2.0 * math.log(0.05))
@@ -76,7 +74,6 @@ def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> Non
         label=f"Ms = {gains.ms:.2f}",
     )  # fmt: skip
     axes.plot(turn.real, turn.imag, color=MUTED, lw=0.9, ls=(0, (1, 2)), label="unit circle")
-    limits = (-2.3, 1.3), (-2.3, 1.3)
     if case.models_around:
         grid = w[:: max(1, w.size // 140)]
         around = [gains.loop(in_loop(case, m)) for m in case.models_around]
@@ -94,7 +91,7 @@ def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> Non
     _margins(axes, gains, values)
     axes.plot([-1.0], [0.0], "+", ms=11, mew=2.0, color=INK)
     axes.annotate("-1", (-1.0, 0.0), (-4, 5), textcoords="offset points", ha="right", color=INK)
-    axes.set(xlim=limits[0], ylim=limits[1], aspect="equal")
+    axes.set(xlim=(-2.3, 1.3), ylim=(-2.3, 1.3), aspect="equal")
     axes.set(xlabel="real part", ylabel="imaginary part")
     legend(figure, columns=2 if narrow else 3)
     finish(figure)

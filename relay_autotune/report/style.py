@@ -155,16 +155,15 @@ def in_steps(times: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatAr
     return t, v
 
 
-def save(figure: Figure, path: str, *, kind: str = "") -> None:
+def save(figure: Figure, path: str) -> None:
     """Write a figure to a file, the same bytes for the same figure.
 
     :param figure: the figure.
-    :param path: the file.
-    :param kind: "png", "svg" or "pdf"; default: as the file's ending says.
+    :param path: the file, which ends with .png, .svg or .pdf.
     """
     import matplotlib
 
-    kind = kind or path.rpartition(".")[2].lower()
+    kind = path.rpartition(".")[2].lower()
     dates = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     with matplotlib.rc_context(_RC):
         figure.savefig(path, dpi=_DPI, facecolor="white", metadata=dates.get(kind), format=kind)
