@@ -62,18 +62,6 @@ class Reason:
         return _MARKS[self.tone]
 
 
-@dataclass(frozen=True)
-class NamedNumber:
-    """A number of the experiment with its name.
-
-    :param name: what it is.
-    :param text: the number with its unit.
-    """
-
-    name: str
-    text: str
-
-
 # By what present gains are compared with new ones: names, fields, units and meanings.
 _NUMBERS = (("kc", "u/y"), ("ti", "s"), ("td", "s"), ("tf", "s"), ("b", ""))
 _EFFECTS = (
@@ -204,12 +192,12 @@ def compared_numbers(
     ]
 
 
-def repeats_of(case: Case) -> tuple[NamedNumber, ...]:
+def repeats_of(case: Case) -> tuple[tuple[str, str], ...]:
     """Return how to make the same report, and the same test, again: names and commands.
 
     :param case: the experiment.
     """
-    found = [NamedNumber("The same report:", case.command)] if case.command else []
+    found = [("The same report:", case.command)] if case.command else []
     relay = case.settings
     if relay is not None and relay.amplitude > 0.0:
         values = {
@@ -225,7 +213,7 @@ def repeats_of(case: Case) -> tuple[NamedNumber, ...]:
             if value and math.isfinite(value)
         )
         command = f"ros2 run relay_autotune relay_node --ros-args {given}"
-        found.append(NamedNumber("The same relay in a live loop:", command))
+        found.append(("The same relay in a live loop:", command))
     return tuple(found)
 
 
@@ -284,8 +272,8 @@ def _number(value: float) -> str:
     return f"{value:g}" if math.isinf(value) else digits(value, 3)
 
 
-def numbers_of(case: Case) -> tuple[NamedNumber, ...]:
-    """Return the numbers of the limit cycle.
+def numbers_of(case: Case) -> tuple[tuple[str, str], ...]:
+    """Return the numbers of the limit cycle with their units, each behind its name.
 
     :param case: the experiment.
     """
@@ -293,17 +281,17 @@ def numbers_of(case: Case) -> tuple[NamedNumber, ...]:
     if cycle is None:
         return ()
     found = [
-        NamedNumber("period", f"{digits(cycle.period)} s"),
-        NamedNumber("high / low", f"{digits(cycle.period_high)} s / {digits(cycle.period_low)} s"),
-        NamedNumber("measurement", f"{digits(cycle.peak_min)} to {digits(cycle.peak_max)} y"),
-        NamedNumber("cycles averaged", f"{len(cycle.cycles)}"),
-        NamedNumber("limit cycle", "settled" if cycle.converged else "still changing"),
+        ("period", f"{digits(cycle.period)} s"),
+        ("high / low", f"{digits(cycle.period_high)} s / {digits(cycle.period_low)} s"),
+        ("measurement", f"{digits(cycle.peak_min)} to {digits(cycle.peak_max)} y"),
+        ("cycles averaged", f"{len(cycle.cycles)}"),
+        ("limit cycle", "settled" if cycle.converged else "still changing"),
     ]
     if case.settings is not None:
         found += [
-            NamedNumber("relay", f"±{digits(case.settings.amplitude)} u"),
-            NamedNumber("bias", f"{digits(case.settings.bias)} u"),
-            NamedNumber("hysteresis", f"±{digits(case.settings.hysteresis)} y"),
+            ("relay", f"±{digits(case.settings.amplitude)} u"),
+            ("bias", f"{digits(case.settings.bias)} u"),
+            ("hysteresis", f"±{digits(case.settings.hysteresis)} y"),
         ]
     return tuple(found)
 
