@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, dataclass, is_dataclass
 from functools import cache
 from types import UnionType
-from typing import Any, get_args, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +24,8 @@ from numpy.typing import ArrayLike
 from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.quantities import ResultField, result_fields
 from relay_autotune.text import visible
+
+_T = TypeVar("_T")
 
 # Largest relative difference, by rounding, of a number from the one that follows from others.
 _SAME = 1e-9
@@ -110,7 +112,7 @@ def to_document(value: object) -> dict[str, Any]:
     return found
 
 
-def of_document(kind: Any, document: Any, **given: Any) -> Any:
+def of_document(kind: type[_T], document: Any, **given: Any) -> _T:
     """Return the result that a document tells.
 
     A field that documents of earlier versions lack has its default.
@@ -264,8 +266,8 @@ def _write_columns(message: Any, items: Sequence[object], kind: type, prefix: st
 
 
 def of_message(
-    kind: Any, message: Any, error: type[RelayAutotuneError], of: str, prefix: str = ""
-) -> Any:
+    kind: type[_T], message: Any, error: type[RelayAutotuneError], of: str, prefix: str = ""
+) -> _T:
     """Return the result that a message tells.
 
     :param kind: class of the result.
@@ -305,7 +307,7 @@ def _of_field(
     held = getattr(message, name)
     if get_origin(each.kind) is np.ndarray:
         held = np.asarray(held, dtype=np.float64)
-        _require_length(name, held, message.parameters, "parameters", error, of)
+        require_length(name, len(held), len(message.parameters), "parameters", error, of)
     elif get_origin(each.kind) is tuple:
         held = tuple(_shown(get_args(each.kind)[0](item)) for item in held)
     else:
@@ -330,7 +332,7 @@ def _read_columns(
         parts = []
         for name, _ in _parts(each, prefix):
             held, first = list(getattr(message, name)), first or name
-            _require_length(name, held, getattr(message, first), first, error, of)
+            require_length(name, len(held), len(getattr(message, first)), first, error, of)
             problem = None if each.kind is str else each.problem(held)
             if problem is not None:
                 raise error(f"{name} {of} {problem}")
@@ -341,12 +343,22 @@ def _read_columns(
     )
 
 
-def _require_length(
-    name: str, found: Any, like: Any, first: str, error: type[RelayAutotuneError], of: str
+def require_length(
+    name: str, found: int, expected: int, first: str, error: type[RelayAutotuneError], of: str
 ) -> None:
-    if len(found) != len(like):
+    """Refuse an array of a message that does not go with another one.
+
+    :param name: of the array.
+    :param found: its length.
+    :param expected: the length that it has to have.
+    :param first: name of the other one.
+    :param error: what to raise.
+    :param of: what the array belongs to, as in "of the model".
+    :raises RelayAutotuneError: of that kind.
+    """
+    if found != expected:
         raise error(
-            f"{name} {of} has {len(found)} numbers, expected {len(like)}: one for each of {first}"
+            f"{name} {of} has {found} numbers, expected {expected}: one for each of {first}"
         )
 
 

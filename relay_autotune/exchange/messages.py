@@ -150,8 +150,7 @@ def settings_from_message(message: Any) -> RelaySettings | None:
     """
     if float(message.amplitude) == 0.0:
         return None
-    found: RelaySettings = of_message(RelaySettings, message, RecordError, "of the relay")
-    return found
+    return of_message(RelaySettings, message, RecordError, "of the relay")
 
 
 def fill_experiment(message: Any, record: Record, *, arrays: bool = True) -> None:
@@ -360,8 +359,7 @@ def finding_from_message(message: Any) -> FitProgress:
     :param message: the message.
     :raises ParameterError: if a number is out of range.
     """
-    found: FitProgress = of_message(FitProgress, message, ParameterError, "of the experiment")
-    return found
+    return of_message(FitProgress, message, ParameterError, "of the experiment")
 
 
 def identification_from_message(message: Any) -> Identification:
@@ -374,8 +372,7 @@ def identification_from_message(message: Any) -> Identification:
     from relay_autotune.exchange import models  # noqa: F401  (it says how they are read)
     from relay_autotune.identification.result import Identification
 
-    found: Identification = of_message(Identification, message, ModelError, "of the model")
-    return found
+    return of_message(Identification, message, ModelError, "of the model")
 
 
 def transfer_function_from_message(message: Any) -> TransferFunction:
@@ -396,8 +393,7 @@ def gains_from_message(message: Any) -> Gains:
     """
     from relay_autotune.loop.gains import Gains
 
-    found: Gains = of_message(Gains, message, TuningError, "of the gains")
-    return found
+    return of_message(Gains, message, TuningError, "of the gains")
 
 
 def fill_gains(

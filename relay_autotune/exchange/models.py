@@ -25,6 +25,7 @@ from relay_autotune.exchange.fields import (
     named,
     number,
     of_document,
+    require_length,
     to_document,
     word,
 )
@@ -147,14 +148,8 @@ def _estimate_of_message(message: Any, error: type[RelayAutotuneError], of: str)
     model, names = model_of_message(message), tuple(map(str, message.parameters))
     std = np.asarray(message.std, dtype=np.float64)
     covariance = np.asarray(message.covariance, dtype=np.float64)
-    for name, found, expected in (
-        ("std", std.size, len(names)),
-        ("covariance", covariance.size, len(names) ** 2),
-    ):
-        if found != expected:
-            raise error(
-                f"{name} {of} has {found} numbers, expected {expected}: one for each of parameters"
-            )
+    require_length("std", std.size, len(names), "parameters", error, of)
+    require_length("covariance", covariance.size, len(names) ** 2, "parameters", error, of)
     if bool(np.any(std < 0.0)):
         raise error(f"std {of} has a negative number, expected >= 0 or NaN")
     covariance = covariance.reshape(len(names), len(names))

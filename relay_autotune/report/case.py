@@ -385,5 +385,4 @@ def _limit_cycle(c: dict[str, Any]) -> LimitCycle:
     # Documents have the number of cycles alone.
     if not 0 <= int(c["cycles"]) <= _MOST_CYCLES:
         raise ValueError(f"{c['cycles']} cycles")
-    found: LimitCycle = of_document(LimitCycle, c, cycles=tuple(range(int(c["cycles"]))))
-    return found
+    return of_document(LimitCycle, c, cycles=tuple(range(int(c["cycles"]))))
