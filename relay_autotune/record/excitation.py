@@ -14,7 +14,13 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.record.cycles import GAP_INTERVALS, follow_measurement, two_level_runs
-from relay_autotune.record.record import Input, Record, cached_on_record, roughness
+from relay_autotune.record.record import (
+    Input,
+    PiecewiseConstant,
+    Record,
+    cached_on_record,
+    roughness,
+)
 
 # Least number of switches between two levels for a relay phase: two whole cycles.
 _FEWEST_SWITCHES = 4
@@ -260,13 +266,12 @@ def _in_part(record: Record, first: int, last: int) -> list[Stretch]:
         times, values, last = times[:-1], values[:-1], last - 1
     if times.size == 0:
         return []
-    earlier = held.values[: int(np.argmax(inside))]
-    before = float(earlier[-1]) if earlier.size else held.initial
     noise = roughness(record.measurement[first : last + 1])
     if often and np.unique(values).size >= _FEWEST_VALUES:
         return _with_rest(record, first, last, noise, _moving(record, first, last, noise))
     noise = min(noise, _noise_between(record, first, last, times))
-    changes = _Changes(times, np.concatenate(([before], values)))
+    before = held.levels[int(np.argmax(inside))]
+    changes = PiecewiseConstant(times, values, before)
     return _with_rest(record, first, last, noise, _switching_parts(record, last, changes, noise))
 
 
@@ -284,23 +289,11 @@ def _noise_between(record: Record, first: int, last: int, changes: FloatArray) -
     return roughness(y, quiet) if np.any(quiet) else math.inf
 
 
-@dataclass(frozen=True)
-class _Changes:
-    """Changes of a command.
-
-    :param times: of each [s], shape (m,).
-    :param levels: before the first and after each, shape (m + 1,).
-    """
-
-    times: FloatArray
-    levels: FloatArray
-
-
 # --- a command that is constant between its changes
 
 
 def _switching_parts(
-    record: Record, last: int, changes: _Changes, noise: float
+    record: Record, last: int, changes: PiecewiseConstant, noise: float
 ) -> list[tuple[float, float, str, str]]:
     """Return begin, end, kind and reason of each experiment, without the rest around it."""
     runs = _two_level_runs(changes)
@@ -326,24 +319,19 @@ def _switching_parts(
     return sorted(found)
 
 
-def _two_level_runs(changes: _Changes) -> list[tuple[int, int]]:
+def _two_level_runs(changes: PiecewiseConstant) -> list[tuple[int, int]]:
     """Return first change and the one after the last of each run that may be a relay's."""
-    runs = two_level_runs(changes.levels)
-    parts = [part for run in runs for part in _without_long_stays(changes.times, *run)]
-    return [(begin, stop) for begin, stop in parts if stop - begin >= _FEWEST_SWITCHES]
-
-
-def _without_long_stays(times: FloatArray, begin: int, stop: int) -> list[tuple[int, int]]:
-    stays = np.diff(times[begin:stop])
-    if stays.size < _FEWEST_SWITCHES - 1:
-        return []
-    cuts = begin + 1 + np.flatnonzero(stays > _LONG_STAY * np.median(stays))
-    bounds = [begin, *cuts.tolist(), stop]
-    return list(itertools.pairwise(bounds))
+    found = []
+    for begin, stop in two_level_runs(changes.levels):
+        stays = np.diff(changes.times[begin:stop])
+        long = stays > _LONG_STAY * np.median(stays) if stays.size else stays
+        cuts = begin + 1 + np.flatnonzero(long)
+        found += itertools.pairwise([begin, *cuts.tolist(), stop])
+    return [(begin, stop) for begin, stop in found if stop - begin >= _FEWEST_SWITCHES]
 
 
 def _with_kick(
-    changes: _Changes, run: tuple[int, int], runs: Sequence[tuple[int, int]]
+    changes: PiecewiseConstant, run: tuple[int, int], runs: Sequence[tuple[int, int]]
 ) -> tuple[int, int]:
     """Add the changes just before and after a relay phase."""
     times, (begin, stop) = changes.times, run
@@ -357,32 +345,26 @@ def _with_kick(
 
 
 def _relay(
-    changes: _Changes, run: tuple[int, int], around: tuple[int, int]
+    changes: PiecewiseConstant, run: tuple[int, int], around: tuple[int, int]
 ) -> tuple[float, float, str, str]:
     begin, stop = run
-    low, high = _levels(changes, run)
+    values = changes.values[begin:stop]
     end = float(changes.times[around[1] - 1] + np.median(np.diff(changes.times[begin:stop])))
     reason = (
-        f"{stop - begin} switches of the command between {low:g} and {high:g} that follow the "
-        f"measurement"
+        f"{stop - begin} switches of the command between {values.min():g} and {values.max():g} "
+        f"that follow the measurement"
     )
     return float(changes.times[around[0]]), end, "relay", reason
 
 
-def _levels(changes: _Changes, run: tuple[int, int]) -> tuple[float, float]:
-    levels = changes.levels[run[0] + 1 : run[1] + 1]
-    return float(np.min(levels)), float(np.max(levels))
-
-
-def _follows(record: Record, changes: _Changes, run: tuple[int, int]) -> bool:
+def _follows(record: Record, changes: PiecewiseConstant, run: tuple[int, int]) -> bool:
     """Return whether the switches of a run follow the measurement, as those of a relay do."""
-    begin, stop = run
-    at = np.clip(np.searchsorted(record.time, changes.times[begin:stop]), 0, len(record) - 1)
-    rises = changes.levels[begin + 1 : stop + 1] > np.mean(_levels(changes, run))
-    return follow_measurement(record, at, rises)
+    times, values = changes.times[slice(*run)], changes.values[slice(*run)]
+    at = np.clip(np.searchsorted(record.time, times), 0, len(record) - 1)
+    return follow_measurement(record, at, values > 0.5 * (values.min() + values.max()))
 
 
-def _settled(record: Record, last: int, changes: _Changes, noise: float) -> FloatArray:
+def _settled(record: Record, last: int, changes: PiecewiseConstant, noise: float) -> FloatArray:
     """Return when the measurement has come to rest after each change [s], shape (m,)."""
     ends = np.append(changes.times[1:], record.time[last])
     settled = np.empty(changes.times.size)
@@ -402,14 +384,14 @@ def _settled(record: Record, last: int, changes: _Changes, noise: float) -> Floa
     return settled
 
 
-def _rests(changes: _Changes, settled: FloatArray, group: Sequence[int], k: int) -> bool:
+def _rests(changes: PiecewiseConstant, settled: FloatArray, group: Sequence[int], k: int) -> bool:
     """Return whether a long rest before a change separates two experiments."""
     moved = float(settled[k - 1] - changes.times[group[0]])
     return bool(changes.times[k] - settled[k - 1] > _REST * moved)
 
 
 def _steps(
-    changes: _Changes, settled: FloatArray, group: Sequence[int]
+    changes: PiecewiseConstant, settled: FloatArray, group: Sequence[int]
 ) -> list[tuple[float, float, str, str]]:
     if not group:
         return []

@@ -236,10 +236,14 @@ class PiecewiseConstant:
         changed = np.flatnonzero(np.diff(values, prepend=initial) != 0.0)
         return cls(times[changed], values[changed], initial)
 
+    @property
+    def levels(self) -> FloatArray:
+        """The level before the first instant and from each on, shape (m + 1,)."""
+        return np.append(self.initial, self.values)
+
     def __call__(self, t: FloatArray) -> FloatArray:
         """Return the level in force at each time ``t`` [s], any shape."""
-        index = np.searchsorted(self.times, t, side="right")
-        return np.concatenate(([self.initial], self.values))[index]
+        return self.levels[np.searchsorted(self.times, t, side="right")]
 
 
 @dataclass(frozen=True)

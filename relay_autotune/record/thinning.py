@@ -186,6 +186,5 @@ def _means(held: PiecewiseConstant, at: FloatArray) -> FloatArray:
     """Return the mean of a held signal between each two instants, shape (m - 1,)."""
     first, last = min(held.times[0], at[0]) - 1.0, max(held.times[-1], at[-1]) + 1.0
     knots = np.concatenate(([first], held.times, [last]))
-    levels = np.append(held.initial, held.values)
-    area = np.append(0.0, np.cumsum(levels * np.diff(knots)))
+    area = np.append(0.0, np.cumsum(held.levels * np.diff(knots)))
     return np.asarray(np.diff(np.interp(at, knots, area)) / np.diff(at))
