@@ -190,11 +190,10 @@ def _remarks_and_values(
             f"{full / law.full:g}."
         )
     low, high = sorted(scale * limit for limit in limits)
-    limits = low, high
     where = ""
     if law.bounds is None:
-        ends = (f"{limit:g}" if math.isfinite(limit) else "none" for limit in limits)
-        known = any(map(math.isfinite, limits))
+        ends = (f"{limit:g}" if math.isfinite(limit) else "none" for limit in (low, high))
+        known = math.isfinite(low) or math.isfinite(high)
         set_there = f"; set them to {' and '.join(ends)}" if known else ""
         where = f"Limits of the command are set in the program{set_there}. "
     told: tuple[str, ...] = (
@@ -212,13 +211,13 @@ def _remarks_and_values(
     stays = ("antiwindup_strategy",) if target.is_set_up else ()
     values = [(each.name, each.of(at)) for each in law.settings if each.name not in stays]
     if law.bounds is not None:
-        values += law.bounds(*limits)
+        values += law.bounds(low, high)
     if law.start is not None:
         known = not math.isnan(target.present)
         present, rest = scale * target.present, f" The process rested at {target.present:.6g} u."
         if not known:
             # Code begins at the command next to 0, and says so.
-            present = min(max(0.0, limits[0]), limits[1])
+            present = min(max(0.0, low), high)
             done = f": put it in place of {present:g}" if law.start.needs else ", and is left out"
             rest = f" It is not known here{done}." * bool(law.start.name)
         told += (f"Start without a bump: {law.start.words}{rest}",)

@@ -64,22 +64,10 @@ _ROUNDING = 1e-6
 _WINDOW = 12
 
 
-@dataclass(frozen=True)
-class Switches:
-    """What the relay did with its command.
-
-    :param kicks: instants at which it left the baseline for one of its levels [s].
-    :param switches: instants at which it went from one level to the other [s].
-    :param released: instants at which it went back to the baseline [s].
-    """
-
-    kicks: FloatArray
-    switches: FloatArray
-    released: FloatArray
-
-
-def switches_of(record: Record, settings: RelaySettings) -> Switches:
-    """Return the kicks, switches and releases of a relay from its commands.
+def switches_of(
+    record: Record, settings: RelaySettings
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return when a relay left its baseline, switched, and went back, by its commands [s].
 
     :param record: the experiment.
     :param settings: of its relay.
@@ -89,10 +77,10 @@ def switches_of(record: Record, settings: RelaySettings) -> Switches:
     low = np.abs(record.command - settings.low) <= tolerance
     level = high.astype(int) - low.astype(int)
     before, after, time = level[:-1], level[1:], record.time[1:]
-    return Switches(
-        kicks=time[(before == 0) & (after != 0)],
-        switches=time[before * after == -1],
-        released=time[(before != 0) & (after == 0)],
+    return (
+        time[(before == 0) & (after != 0)],
+        time[before * after == -1],
+        time[(before != 0) & (after == 0)],
     )
 
 
@@ -113,7 +101,7 @@ def draw_experiment(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> 
     _shade_cycles(above, case)
     _samples(above, record)
     if settings is not None:
-        _mark(above, record, switches_of(record, settings))
+        _mark(above, record, settings)
     above.set_ylabel("measurement [y]")
     u = record.input()
     inside = (u.times > record.time[0]) & (u.times < record.time[-1])
@@ -159,12 +147,12 @@ def _shade_cycles(axes: Axes, case: Case) -> None:
             )  # fmt: skip
 
 
-def _mark(axes: Axes, record: Record, at: Switches) -> None:
-    for times, marker, colour, label in (
-        (at.kicks, "D", ORANGE, "kick"),
-        (at.switches, "o", BLUE, "switch"),
-        (at.released, "s", PURPLE, "back to the baseline"),
-    ):
+_MARKS = (("D", ORANGE, "kick"), ("o", BLUE, "switch"), ("s", PURPLE, "back to the baseline"))
+
+
+def _mark(axes: Axes, record: Record, settings: RelaySettings) -> None:
+    found = zip(switches_of(record, settings), _MARKS, strict=True)
+    for times, (marker, colour, label) in found:
         if times.size:
             values = np.interp(times, record.time, record.measurement)
             axes.plot(

@@ -33,10 +33,10 @@ def levels(names: str) -> Record:
 
 
 def test_a_kick_is_no_switch_and_neither_is_the_end() -> None:
-    found = switches_of(levels("bbhhblllhhlb"), SETTINGS)
-    np.testing.assert_array_equal(found.kicks, [2.0, 5.0])
-    np.testing.assert_array_equal(found.switches, [8.0, 10.0])
-    np.testing.assert_array_equal(found.released, [4.0, 11.0])
+    kicks, switches, released = switches_of(levels("bbhhblllhhlb"), SETTINGS)
+    np.testing.assert_array_equal(kicks, [2.0, 5.0])
+    np.testing.assert_array_equal(switches, [8.0, 10.0])
+    np.testing.assert_array_equal(released, [4.0, 11.0])
 
 
 def test_a_closed_loop_with_a_law_shows_that_law_sample_by_sample() -> None:
