@@ -127,7 +127,7 @@ def of_document(kind: type[_T], document: Any, **given: Any) -> _T:
         return special.of_document(document)
     found = dict(given)
     seen: set[str] = set()
-    for each in result_fields(kind):
+    for each in result_fields(kind):  # type: ignore[arg-type]
         if each.document is None or each.derived or each.name in given:
             continue
         name = each.document or each.name
@@ -282,7 +282,7 @@ def of_message(
     if special is not None and special.of_message is not None:
         return special.of_message(message, error, of)
     found: dict[str, Any] = {}
-    for each in result_fields(kind):
+    for each in result_fields(kind):  # type: ignore[arg-type]
         if each.message is None or each.derived:
             continue
         part, many = _part_of(each.kind)

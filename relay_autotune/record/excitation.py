@@ -321,7 +321,7 @@ def _switching_parts(
 
 def _two_level_runs(changes: PiecewiseConstant) -> list[tuple[int, int]]:
     """Return first change and the one after the last of each run that may be a relay's."""
-    found = []
+    found: list[tuple[int, int]] = []
     for begin, stop in two_level_runs(changes.levels):
         stays = np.diff(changes.times[begin:stop])
         long = stays > _LONG_STAY * np.median(stays) if stays.size else stays
