@@ -394,8 +394,11 @@ def require_settable(node: Node, changes: Sequence[RosParameter], running: str) 
     values = merged(node, TUNE_PARAMETERS, changes)
     experiment = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}
     parameters = ExperimentParameters(**experiment)
-    # A start request may still give the amplitude; then all is checked at the start.
-    parameters.validate() if parameters.amplitude > 0.0 else parameters.validate_limits()
+    if parameters.amplitude > 0.0:
+        parameters.validate()
+    else:
+        # A start request may still give the amplitude; then all is checked at the start.
+        parameters.validate_limits()
 
 
 def _rest_of(samples: LastSamples) -> str | Reason:
