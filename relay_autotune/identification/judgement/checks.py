@@ -85,7 +85,7 @@ def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> st
     swings, gains, deviations = [], [], []
     for record in records:
         u = record.input()
-        swings.append(0.5 * float(np.ptp(np.append(u.values, u.initial))))
+        swings.append(0.5 * float(np.ptp(u.levels)))
         factor, deviation = _factor(record, response(model, record.time, u))
         gains.append(factor)
         deviations.append(deviation)

@@ -96,8 +96,7 @@ def frequency_point(record: Record, ends: FloatArray, harmonic: int = 1) -> Freq
     w = harmonic * 2.0 * math.pi * (ends.size - 1) / (end - start)
     u = record.input()
     excited = fourier_integral_held(u, start, end, w)
-    levels = np.append(u.values, u.initial)
-    if abs(excited) < 1e-3 * (end - start) * float(np.ptp(levels)) / (2.0 * math.pi * harmonic):
+    if abs(excited) < 1e-3 * (end - start) * float(np.ptp(u.levels)) / (2.0 * math.pi * harmonic):
         raise IdentificationError(
             f"the command holds nothing at harmonic {harmonic} of its cycle; use an odd one"
         )

@@ -197,7 +197,7 @@ def step_test(record: Record) -> StepTest:
         )
     k = int(inside[0])
     begin = float(u.times[k])
-    before = u.initial if k == 0 else float(u.values[k - 1])
+    before = float(u.levels[k])
     end = float(u.times[k + 1]) if k + 1 < u.times.size else math.inf
     # The sample at the step itself was taken before it.
     part = time <= end

@@ -188,7 +188,7 @@ class FitContext:
         u = self.problem.inputs[0]
         if not isinstance(u, PiecewiseConstant):
             return math.inf
-        return _LEAST_FRICTION * float(np.ptp(np.append(u.values, u.initial)))
+        return _LEAST_FRICTION * float(np.ptp(u.levels))
 
     @cached_property
     def pushed(self) -> float:

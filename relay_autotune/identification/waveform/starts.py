@@ -107,7 +107,7 @@ def latest_dead_time(time: FloatArray, y: FloatArray, u: Input, sign: int) -> fl
     if not inside.size or not isinstance(u, PiecewiseConstant):
         return math.inf
     change, k = float(u.times[inside[0]]), int(inside[0])
-    direction = sign * np.sign(u.values[k] - (u.values[k - 1] if k else u.initial))
+    direction = sign * np.sign(u.levels[k + 1] - u.levels[k])
     first = int(np.searchsorted(time, change, side="right"))
     rest = y[:first]
     if rest.size < _RESTING:
