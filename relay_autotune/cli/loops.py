@@ -85,6 +85,8 @@ class Loop:
         self.client, self.options = client, options
         self.answers = Answers(options)
         self.nodes = OwnNodes()
+        # Settings of relay_node before a dry run.
+        self._before: dict[str, Any] = {}
 
     @property
     def title(self) -> str:
@@ -131,9 +133,20 @@ class Loop:
         names = [name for name in self.form if name != "amplitude" or options.web]
         given = [n for n in (*names, "measurement_timeout") if SETTING[n].is_given(options)]
         if given:
-            self.client.set_values(self.client.name, self.answers.parameters(given))
+            values = self.answers.parameters(given)
+            if options.dry_run:
+                self._before = self.client.values(self.client.name, list(values))
+            self.client.set_values(self.client.name, values)
         if options.web:
             self.look()
+
+    def restore(self) -> None:
+        """Give relay_node back the settings from before a dry run, which changes nothing.
+
+        :raises LoopError: if it refuses them or does not answer.
+        """
+        if self._before:
+            self.client.set_values(self.client.name, self._before)
 
     def ask_again(self) -> None:
         """Ask for the last answer again, and tell relay_node."""

@@ -261,6 +261,7 @@ class Session:
                 needs_identifier=not (options.dry_run or options.record_only),
                 leave=lambda: bool(self.signals.came),
             )
+        self.nodes.callback(loop.restore)
         loop.joined()
         return patience
 

@@ -77,10 +77,10 @@ def with_gains_file(words: Sequence[str]) -> list[str]:
         raise ParameterError(
             f"{FLAG} has no file; expected one that tune_loop has written for a controller_node"
         )
-    given = ["--params-file", file]
-    for name, topic in _topics(file).items():
-        given += ["-r", f"{name}:={topic}"]
-    return [*found[:at], *found[at + 2 :], "--ros-args", *given]
+    topics = [word for name, topic in _topics(file).items() for word in ("-r", f"{name}:={topic}")]
+    # Of parameters the last ones count, of names the first ones: what is typed beside the file.
+    rest = [*found[:at], *found[at + 2 :]]
+    return ["--ros-args", "--params-file", file, "--", *rest, "--ros-args", *topics]
 
 
 def _topics(file: str) -> dict[str, str]:

@@ -769,8 +769,14 @@ def test_what_is_given_for_a_loop_whose_nodes_run_goes_to_them_and_the_rest_come
     }  # fmt: skip
     client: Any = SimpleNamespace(
         name="/t/relay_node", set_values=lambda node, values: present.update(values),
-        values=lambda node, names, patience: {name: present[name] for name in names},
+        values=lambda node, names, patience=0.0: {name: present[name] for name in names},
     )  # fmt: skip
+    before = dict(present)
+    dry = Loop(client, tune_loop._parser().parse_args([*words, "--dry-run"]))
+    dry.joined()
+    assert present["safe_command"] == 2.0
+    dry.restore()
+    assert str(present) == str(before)
     Loop(client, tune_loop._parser().parse_args(words)).joined()
     assert (present["baseline"], present["measurement_max"]) == (2.0, 50.0)
     # An amplitude is that of one tune.
@@ -1045,14 +1051,16 @@ def test_somebody_without_a_controller_is_told_how_to_start_one(
     assert set(given) - set(of_file) == {"measurement", "controller_command"}
     assert topics["ros__parameters"] == {n: given[n] for n in topics["ros__parameters"]}
     words = with_gains_file(["--gains", short[-1], "--ros-args", "-p", "kc:=1.0"])
-    assert words[:3] == ["--ros-args", "-p", "kc:=1.0"]
+    # What is typed beside the file counts: of parameters the last ones, of names the first.
+    assert words[:4] == ["--ros-args", "--params-file", short[-1], "--"]
+    assert words[4:7] == ["--ros-args", "-p", "kc:=1.0"]
     # It is typed in any folder, and goes with its recording.
     file = Path(short[-1])
     assert file.is_absolute()
     moved = file.parent.rename(f"{file.parent}_moved") / file.name
-    assert with_gains_file(["--gains", str(moved)])[3:] == words[6:]
-    assert words[3:] == [
-        *("--ros-args", "--params-file", short[-1], "-r", "measurement:=/tank/level"),
+    assert with_gains_file(["--gains", str(moved)])[4:] == words[7:]
+    assert words[7:] == [
+        *("--ros-args", "-r", "measurement:=/tank/level"),
         *("-r", "controller_command:=/tank/valve"),
     ]
     # For another type relay_node stands between controller and actuator.

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import pty
 import re
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import pytest
 from loop_rig import RELIABLE, Rig
+from rcl_interfaces.srv import GetParameters
 from std_msgs.msg import Float64
 
 from relay_autotune.record.record import Outcome
@@ -79,6 +81,11 @@ def test_a_tune_is_shown_and_its_result_printed(rig: Rig) -> None:
     assert status == 0
     assert output.startswith("ok    levels        relay between 0.825 and 1.325 u")
     assert output.endswith("tune_loop --namespace tank --amplitude 0.25\n")
+    status, output, said = run(rig, "--namespace", "tank", "--dry-run", "--at", "1.2")
+    assert status == 0 and "between 0.85 and 1.85 u" in output
+    names = GetParameters.Request(names=["baseline", "safe_command"])
+    kept = rig.call(GetParameters, "tank/relay_node/get_parameters", names).values
+    assert kept[0].double_value == 1.0 and math.isnan(kept[1].double_value)
     said = "tune_loop: no relay_node"  # on a busy machine it is not found so soon
     while error(said).startswith("tune_loop: no relay_node"):
         status, output, said = run(rig, "--namespace", "tank", "--wait", "0.5")
