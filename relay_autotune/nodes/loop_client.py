@@ -24,6 +24,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_namespace import validate_namespace
+from rclpy.validate_node_name import validate_node_name
 from rclpy.validate_topic_name import validate_topic_name
 
 from relay_autotune.errors import FieldError, LoopError, ParameterError
@@ -103,6 +104,7 @@ class LoopClient:
         try:
             validate_namespace(f"/{namespace.strip('/')}")
             validate_topic_name(f"{node}/tune")
+            validate_node_name(node.rpartition("/")[2])
         except NameValidationException as error:
             why = _why_invalid(error)
             raise ParameterError(f"no node can be {namespace}/{node}: {why}") from None

@@ -366,9 +366,6 @@ def _policy_from(values: Mapping[str, Any], *, connected: bool) -> SafePolicy:
     :raises NotReadyError: if the process would drift or run away, and nothing could hold it.
     """
     safe = values["safe_command"]
-    low, high = values["command_min"], values["command_max"]
-    if not math.isnan(safe) and not low <= safe <= high:
-        raise NotReadyError(Code.UNSAFE_COMMAND(value=safe, low=low, high=high))
     kind, gain = values["process_type"], values["hold_gain"]
     if kind == "self_regulating":
         return SafePolicy(command=safe)
@@ -399,6 +396,10 @@ def require_settable(node: Node, changes: Sequence[RosParameter], running: str) 
     else:
         # A start request may still give the amplitude; then all is checked at the start.
         parameters.validate_limits()
+    # It is sent between tunes, too, where a controller_node in front of the relay ends.
+    safe, low, high = values["safe_command"], parameters.command_min, parameters.command_max
+    if not math.isnan(safe) and not low <= safe <= high:
+        raise NotReadyError(Code.UNSAFE_COMMAND(value=safe, low=low, high=high))
 
 
 def _rest_of(samples: LastSamples) -> str | Reason:

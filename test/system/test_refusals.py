@@ -230,6 +230,11 @@ def test_a_dry_run_says_what_would_be_done_and_moves_nothing(idle: Rig) -> None:
         ("relay_node", {"min_cycles": 1}, "min_cycles is 1"),
         (
             "relay_node",
+            {"safe_command": 20.0, "command_max": 5.0},
+            "safe_command is 20, expected from command_min -inf to command_max 5",
+        ),
+        (
+            "relay_node",
             {"measurement_min": 5.0, "measurement_max": 1.0},
             "measurement_min is 5, expected less than measurement_max, which is 1",
         ),
