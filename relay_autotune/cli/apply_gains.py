@@ -68,7 +68,13 @@ _FOUND_WITHIN = 5.0
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
-    options = _parser().parse_args(args)
+    parser = _parser()
+    options = parser.parse_args(args)
+    if options.wait < 0.0:
+        parser.refuse(f"--wait is {options.wait:g}, expected at least 0 s")
+    proves = not (options.no_verify or options.revert or options.file)
+    if (options.step or options.load) and not proves:
+        parser.refuse("--step and --load are those of the proof, which is not made here")
     import relay_autotune.nodes.gains_client  # noqa: F401  see run_command
 
     return guarded_in_graph(PROGRAM, lambda graph: _work(options, graph))

@@ -228,6 +228,23 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     assert not asked and not answers
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--no-verify", "--step", "1"), "--step and --load are those of the proof"),
+        (("--revert", "--load", "0.5"), "--step and --load are those of the proof"),
+        (("--wait", "-1"), "--wait is -1, expected at least 0 s"),
+    ],
+)
+def test_what_has_no_effect_is_refused(
+    words: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        apply_gains.main(words)
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("program", [apply_gains, tune_loop])
 def test_a_step_by_nothing_is_refused(program: Any, capsys: pytest.CaptureFixture[str]) -> None:
     """It made the step of the usual height."""
