@@ -433,18 +433,19 @@ class LoopClient:
         """
         name = self._resolved(topic)
         node = self._node
-        ends_of = (
-            node.get_publishers_info_by_topic
-            if published
-            else node.get_subscriptions_info_by_topic
-        )
+        both = [
+            ("publisher", "--measurement", node.get_publishers_info_by_topic),
+            ("subscription", "--command", node.get_subscriptions_info_by_topic),
+        ]
+        (what, flag, ends_of), (other, _, others_of) = both if published else both[::-1]
         if self.wait(lambda: bool(ends_of(name)), patience):
             return str(ends_of(name)[0].topic_type)
+        lacking = f"{name} has no {what} within {patience:g} s"
+        if others_of(name):
+            raise LoopError(f"{lacking}, but a {other}: the topics may be the wrong way round")
         first, others = quality.nearest(node, name, ends_of)
-        what = "publisher" if published else "subscription"
-        flag = "--measurement" if published else "--command"
         meant = f"; type {flag} {first}" if first else ""
-        raise LoopError(f"{name} has no {what} within {patience:g} s{meant}{others}")
+        raise LoopError(f"{lacking}{meant}{others}")
 
     def others_on(self, topic: str) -> str:
         """Return the names of the nodes that publish a topic, but this and the one called most.

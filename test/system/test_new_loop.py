@@ -239,17 +239,25 @@ def test_a_command_at_which_the_process_does_not_rest_ends_the_tune(rig: Rig) ->
     assert {message.data for message in heard} == {5.0}
 
 
-def test_a_topic_that_is_not_there_is_told_with_the_nearest(rig: Rig) -> None:
+@pytest.mark.parametrize(
+    ("topic", "meant"),
+    [
+        ("/tank/levle", "; type --measurement /tank/level"),
+        ("/tank/valve", ", but a subscription: the topics may be the wrong way round"),
+    ],
+)
+def test_a_topic_that_is_not_there_is_told_with_what_may_be_meant(
+    rig: Rig, topic: str, meant: str
+) -> None:
     rig.start("plant_node", *TOPICS, **FAST)
-    words = [word.replace("/tank/level", "/tank/levle") for word in WORDS]
+    words = [word.replace("/tank/level", topic) for word in WORDS]
     done = subprocess.run(
         [shutil.which("tune_loop"), *words, "--wait", "6"],
         env=rig.environment, capture_output=True, text=True, timeout=60.0, check=False,
     )  # fmt: skip
     assert done.returncode == 1
     told = done.stderr.splitlines()[-1]
-    assert told.startswith("tune_loop: /tank/levle has no publisher within 6 s")
-    assert "type --measurement /tank/level" in told
+    assert told.startswith(f"tune_loop: {topic} has no publisher within 6 s{meant}")
 
 
 def test_what_cannot_be_a_topic_is_refused_in_one_line(rig: Rig) -> None:
