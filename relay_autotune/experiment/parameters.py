@@ -165,11 +165,21 @@ class ExperimentParameters:
         if baseline is not None:
             self._validate_levels(baseline)
 
-    def validate_limits(self) -> None:
-        """Refuse limits in the wrong order, which no amplitude of a start request mends.
+    def validate_but_amplitude(self) -> None:
+        """Refuse values that contradict each other, whatever amplitude a start request gives.
 
-        :raises ParameterError: with a sentence that names the two and their values.
+        :raises ParameterError: with a sentence that names both and their values.
         """
+        if self.max_cycles < self.min_cycles:
+            raise ParameterError(
+                f"max_cycles is {self.max_cycles}, expected at least min_cycles, "
+                f"which is {self.min_cycles}"
+            )
+        if 0.0 < self.max_duration <= self.settle_time:
+            raise ParameterError(
+                f"max_duration is {self.max_duration:g} s, expected more than settle_time, "
+                f"which is {self.settle_time:g} s"
+            )
         for signal in ("measurement", "command"):
             low, high = getattr(self, f"{signal}_min"), getattr(self, f"{signal}_max")
             if low >= high:
@@ -185,7 +195,7 @@ class ExperimentParameters:
             )
 
     def _validate_together(self) -> None:
-        self.validate_limits()
+        self.validate_but_amplitude()
         if self.finds_amplitude:
             limits = ("command_min", "command_max")
             lacking = [name for name in limits if not math.isfinite(getattr(self, name))]
@@ -200,16 +210,6 @@ class ExperimentParameters:
                 f"bias is {self.bias:g}, expected less than the amplitude {self.amplitude:g} in "
                 f"magnitude: otherwise both levels lie on one side of the baseline and the "
                 f"measurement never comes back"
-            )
-        if self.max_cycles < self.min_cycles:
-            raise ParameterError(
-                f"max_cycles is {self.max_cycles}, expected at least min_cycles, "
-                f"which is {self.min_cycles}"
-            )
-        if 0.0 < self.max_duration <= self.settle_time:
-            raise ParameterError(
-                f"max_duration is {self.max_duration:g} s, expected more than settle_time, "
-                f"which is {self.settle_time:g} s"
             )
 
     def _validate_levels(self, baseline: float) -> None:

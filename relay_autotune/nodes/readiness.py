@@ -395,7 +395,7 @@ def require_settable(node: Node, changes: Sequence[RosParameter], running: str) 
         parameters.validate()
     else:
         # A start request may still give the amplitude; then all is checked at the start.
-        parameters.validate_limits()
+        parameters.validate_but_amplitude()
     # It is sent between tunes, too, where a controller_node in front of the relay ends.
     safe, low, high = values["safe_command"], parameters.command_min, parameters.command_max
     if not math.isnan(safe) and not low <= safe <= high:

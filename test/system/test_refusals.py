@@ -228,6 +228,7 @@ def test_a_dry_run_says_what_would_be_done_and_moves_nothing(idle: Rig) -> None:
         ("relay_node", {"amplitude": math.nan}, "amplitude is nan"),
         ("relay_node", {"amplitude": 1}, "amplitude is 1, expected a number with a decimal"),
         ("relay_node", {"min_cycles": 1}, "min_cycles is 1"),
+        ("relay_node", {"max_cycles": 2}, "max_cycles is 2, expected at least min_cycles"),
         (
             "relay_node",
             {"safe_command": 20.0, "command_max": 5.0},
