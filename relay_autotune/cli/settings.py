@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
-from relay_autotune.cli.arguments import finite, flag_of, given_quantities, step_height
+from relay_autotune.cli.arguments import finite, flag_of, step_height
 from relay_autotune.cli.terminal import BACK, UNITS, GoBack, asked, number_of, pair_of
 from relay_autotune.errors import SelectionError
 from relay_autotune.loop.laws import LAWS
@@ -484,9 +484,8 @@ def kind_of(options: argparse.Namespace) -> Kind:
     """Return which kind of loop is to be tuned.
 
     :param options: with the flags of `add_settings`.
-    :raises SelectionError: if the flags do not go together, or a value is out of its range.
+    :raises SelectionError: if the flags do not go together.
     """
-    given_quantities(options, SETTINGS)
     kind = Kind.NODES
     lacking = [f"--{name}" for name in ("measurement", "command") if not getattr(options, name)]
     if options.controller or options.joint:

@@ -35,11 +35,12 @@ from relay_autotune.cli.arguments import (
     Parser,
     add_web,
     check_web,
+    given_quantities,
     guarded_in_graph,
     say,
 )
 from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN
-from relay_autotune.cli.settings import FLAGS, Kind, add_settings, kind_of
+from relay_autotune.cli.settings import FLAGS, SETTINGS, Kind, add_settings, kind_of
 from relay_autotune.cli.terminal import (
     GoBack,
     Signals,
@@ -90,7 +91,8 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _require_consistent(options: argparse.Namespace) -> None:
-    """Refuse options that contradict each other."""
+    """Refuse options that are out of their range, or contradict each other."""
+    given_quantities(options, SETTINGS)
     if options.web and (options.dry_run or options.json or options.report or options.export):
         raise SelectionError(
             "--web has check, result, report and exports on its page: leave out --dry-run, "
