@@ -406,7 +406,7 @@ def response(model: TransferFunction, time: ArrayLike, u: PiecewiseConstant) -> 
         return np.zeros(t.shape)
     end = max(float(flat.max()), float(changes[-1]))
     modes = Modes.of(model, horizon=max(end - float(changes[0]), np.finfo(float).tiny))
-    states = modes.states(changes, np.diff(u.values, prepend=u.initial))
+    states = modes.states(changes, np.diff(u.levels))
     segment = np.searchsorted(changes, flat, side="right") - 1
     after = segment >= 0
     y = np.zeros(flat.shape)

@@ -345,7 +345,7 @@ def _turns(u: Input) -> PiecewiseConstant:
     that direction.
     """
     assert isinstance(u, PiecewiseConstant)
-    moves = np.sign(np.diff(u.values, prepend=u.initial))
+    moves = np.sign(np.diff(u.levels))
     moved = moves != 0.0
     return PiecewiseConstant(u.times[moved], moves[moved], 0.0)
 

@@ -107,7 +107,8 @@ def latest_dead_time(time: FloatArray, y: FloatArray, u: Input, sign: int) -> fl
     if not inside.size or not isinstance(u, PiecewiseConstant):
         return math.inf
     change, k = float(u.times[inside[0]]), int(inside[0])
-    direction = sign * np.sign(u.levels[k + 1] - u.levels[k])
+    before, after = u.levels[k : k + 2]
+    direction = sign * np.sign(after - before)
     first = int(np.searchsorted(time, change, side="right"))
     rest = y[:first]
     if rest.size < _RESTING:
@@ -163,7 +164,7 @@ def time_scales(problem: Problem) -> tuple[float, float]:
         rest = answering_time(time, u)
         if inside.size > _MOST_SWITCHES * time.size and isinstance(u, PiecewiseConstant):
             # A controller moves a little at each sample, and far when its set-point is switched.
-            steps = np.abs(np.diff(u.values, prepend=u.initial))
+            steps = np.abs(np.diff(u.levels))
             large = u.times[steps >= _SWITCH * float(np.ptp(u.values))]
             inside = large[(large >= time[0]) & (large < time[-1])]
         if inside.size >= 4:
