@@ -259,7 +259,7 @@ class GainsClient(LoopClient):
         goal.apply = new is not None
         with (
             self.allowing(verify_step_max=abs(setpoint)),
-            self._offered(new) if new else nullcontext(),
+            self._offered(new) if goal.apply else nullcontext(),
         ):
             try:
                 return self._verified(goal, tell, leave)

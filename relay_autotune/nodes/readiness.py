@@ -378,10 +378,10 @@ def _policy_from(values: Mapping[str, Any], *, connected: bool) -> SafePolicy:
 
 
 def require_settable(node: Node, changes: Sequence[RosParameter], running: str) -> None:
-    """Refuse a change of parameters that is not possible now; without one, what they are.
+    """Refuse a change of parameters that is not possible now, or values that cannot be.
 
     :param node: relay_node.
-    :param changes: the changes about to be made.
+    :param changes: the changes about to be made; none: the present values are looked at.
     :param running: id of the running tune; empty: no tune runs.
     :raises RelayAutotuneError: with the reason.
     """
