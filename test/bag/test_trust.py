@@ -145,6 +145,21 @@ def test_chunks_that_together_expand_too_far_are_refused(tmp_path, monkeypatch):
     np.testing.assert_array_equal(read(path)[0], np.arange(COUNT))
 
 
+def test_a_file_that_nothing_can_be_expanded_into_is_told(tmp_path, monkeypatch):
+    """Where no temporary file could be made, that came as a defect."""
+    path = write(tmp_path / "bag.mcap")
+    packed = tmp_path / "bag.mcap.zstd"
+    packed.write_bytes(zstandard.compress(path.read_bytes()))
+    np.testing.assert_array_equal(read(packed)[0], np.arange(COUNT))
+
+    def refused(**_):
+        raise FileNotFoundError(2, "No usable temporary directory found")
+
+    monkeypatch.setattr(source.tempfile, "TemporaryFile", refused)
+    with pytest.raises(BagError, match=r"^cannot expand .*: No usable temporary directory found$"):
+        read(packed)
+
+
 def _bag_of(*records):
     """Return a bag without a summary whose one chunk, compressed, has these records too."""
 
