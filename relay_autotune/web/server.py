@@ -29,13 +29,12 @@ from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from relay_autotune.errors import RelayAutotuneError, SelectionError, TuningError, defect
-from relay_autotune.exchange.export import exported, exports_of, file_name
+from relay_autotune.exchange.export import EXPORTS, exported, exports_of, file_name
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.report.page import page as report_page
 from relay_autotune.report.page import style_sheet
 from relay_autotune.text import in_units, visible
-from relay_autotune.tuning import RULES
 from relay_autotune.web import wire
 from relay_autotune.web.address import Address
 from relay_autotune.web.live import Live, PageCommand
@@ -140,7 +139,7 @@ class Page:
         """
         if not (isinstance(number, int) and 0 <= number < len(self.subjects)):
             raise TuningError("there is no such experiment")
-        return number, asked_of(given, tuple(RULES))
+        return number, asked_of(given)
 
     def known(self, number: int, asked: DesignRequest) -> str | None:
         """Return the answer to what a page asks, as JSON; None: it has to be computed.
@@ -265,14 +264,31 @@ class _Guarded(RequestHandler):
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.finish(f"{status_code}: {self._reason}\n")
 
-    def subject_and_asked(self) -> tuple[int, DesignRequest]:
+    def subject_and_asked(self) -> tuple[PageModel, DesignRequest]:
         """Return the model and what is asked for, from the request's query."""
         try:
             given = parse_qs(self.request.query, max_num_fields=10)
             fields = _read(given.get("asked", ["{}"])[0])
-            return self.page.question(int(given.get("of", ["0"])[0]), fields)
+            number, asked = self.page.question(int(given.get("of", ["0"])[0]), fields)
         except (ValueError, RecursionError) as error:
             raise HTTPError(HTTPStatus.BAD_REQUEST, reason="Not understood") from error
+        return self.page.subjects[number], asked
+
+    async def send(self, worker: Worker, written: Callable[[], str], kind: str, name: str) -> None:
+        """Answer with a file to keep.
+
+        :param worker: computes it.
+        :param written: returns what stands in it.
+        :param kind: of text.
+        :param name: of the file.
+        """
+        try:
+            text = await asyncio.wrap_future(worker.ask(written))
+        except RelayAutotuneError as error:
+            raise HTTPError(HTTPStatus.CONFLICT, reason=_one_line(error)) from error
+        self.set_header("Content-Type", f"text/{kind}; charset=utf-8")
+        self.set_header("Content-Disposition", f'attachment; filename="{name}"')
+        self.finish(text)
 
 
 class _Static(_Guarded):
@@ -303,8 +319,7 @@ class _Report(_Guarded):
 
     async def get(self) -> None:
         """Answer with the report."""
-        number, asked = self.subject_and_asked()
-        subject = self.page.subjects[number]
+        subject, asked = self.subject_and_asked()
 
         def written() -> str:
             if subject.shaping is None:
@@ -312,13 +327,7 @@ class _Report(_Guarded):
             return report_page([subject.case_with(subject.shaped(asked))])
 
         # Figures take seconds to draw, for which the slider must not wait.
-        try:
-            text = await asyncio.wrap_future(self.page.slow.ask(written))
-        except RelayAutotuneError as error:
-            raise HTTPError(HTTPStatus.CONFLICT, reason=_one_line(error)) from error
-        self.set_header("Content-Type", "text/html; charset=utf-8")
-        self.set_header("Content-Disposition", 'attachment; filename="tune.html"')
-        self.finish(text)
+        await self.send(self.page.slow, written, "html", "tune.html")
 
 
 class _Export(_Guarded):
@@ -326,23 +335,21 @@ class _Export(_Guarded):
 
     async def get(self, name: str) -> None:
         """Answer with the file."""
-        number, asked = self.subject_and_asked()
-        subject = self.page.subjects[number]
-        try:
-            shaped = await asyncio.wrap_future(
-                self.page.worker.ask(partial(subject.shaped, asked))
-            )
+        if name not in EXPORTS:
+            raise HTTPError(HTTPStatus.NOT_FOUND)
+        subject, asked = self.subject_and_asked()
+        accepts = self.get_query_argument("accept_doubtful", "") == "yes"
+
+        def written() -> str:
+            shaped = subject.shaped(asked)
             if name not in exports_of(shaped.gains.law):
                 raise HTTPError(HTTPStatus.NOT_FOUND)
             doubt = shaped.judgement.reason
-            if doubt and self.get_query_argument("accept_doubtful", "") != "yes":
+            if doubt and not accepts:
                 raise TuningError("these gains are doubtful, and were not accepted")
-            text = exported(shaped.gains, name, subject.target, doubt=doubt)
-        except RelayAutotuneError as error:
-            raise HTTPError(HTTPStatus.CONFLICT, reason=_one_line(error)) from error
-        self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.set_header("Content-Disposition", f'attachment; filename="{file_name(name)}"')
-        self.finish(text)
+            return exported(shaped.gains, name, subject.target, doubt=doubt)
+
+        await self.send(self.page.worker, written, "plain", file_name(name))
 
 
 class _Socket(_Guarded, WebSocketHandler):
@@ -441,7 +448,7 @@ class _Socket(_Guarded, WebSocketHandler):
         return PageCommand(
             question["do"],
             of,
-            None if asked is None else asked_of(asked, tuple(RULES)),
+            None if asked is None else asked_of(asked),
             question.get("step", 0.0),
             question.get("accept_doubtful") is True,
             dict(question.get("settings", {})),

@@ -31,7 +31,7 @@ from relay_autotune.report.frequency import (
     swept_parts,
 )
 from relay_autotune.result import Shaping
-from relay_autotune.tuning import DEFAULT_RULE, Designed, designed, judged
+from relay_autotune.tuning import DEFAULT_RULE, RULES, Designed, designed, judged
 from relay_autotune.tuning.ensemble import ms_on_each
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import NOT_JUDGED, Judgement, Verdict
@@ -381,18 +381,17 @@ def _curve(
     return values, band
 
 
-def asked_of(given: object, rules: tuple[str, ...]) -> DesignRequest:
+def asked_of(given: object) -> DesignRequest:
     """Return what a page asks for, from the fields of its message.
 
     :param given: as JSON was read; what is missing has its default.
-    :param rules: the names of the rules that it may name.
     :raises TuningError: if a value cannot be.
     """
     if not isinstance(given, dict):
         raise TuningError("expected what is asked for as an object of names and values")
     values = {each.name: given.get(each.name, each.default) for each in fields(DesignRequest)}
     known = {each.name: each for each in declared(DesignOptions)}
-    known["rule"] = Quantity("rule", DEFAULT_RULE, choices=rules)
+    known["rule"] = Quantity("rule", DEFAULT_RULE, choices=tuple(RULES))
     for each in fields(DesignRequest):
         value = values[each.name]
         if value is None and each.default is None:
