@@ -40,7 +40,7 @@ from relay_autotune.cli.arguments import (
     say,
 )
 from relay_autotune.cli.own_nodes import PROGRAM, START_WITHIN
-from relay_autotune.cli.settings import FLAGS, SETTINGS, Kind, add_settings, kind_of
+from relay_autotune.cli.settings import FLAGS, SETTINGS, Answers, Kind, add_settings, kind_of
 from relay_autotune.cli.terminal import (
     GoBack,
     Signals,
@@ -74,14 +74,6 @@ def main(args: Sequence[str] | None = None) -> int:
         kind = kind_of(options)
     except SelectionError as error:
         parser.refuse(str(error))
-    starts = kind is not Kind.NODES
-    if starts:
-        # At once, since what follows takes a second to load.
-        what = (options.joint or options.measurement, options.controller or options.command)
-        told = f"looking at {what[0]} and {what[1]}; nothing is commanded yet"
-        print(told, file=sys.stderr, flush=True)
-    with Working("loading what talks to the nodes") if starts else nullcontext():
-        import relay_autotune.nodes.tune_client  # noqa: F401  see run_command
 
     def work(graph: ExitStack) -> int:
         with ExitStack() as nodes:
@@ -93,6 +85,13 @@ def main(args: Sequence[str] | None = None) -> int:
 def _require_consistent(options: argparse.Namespace) -> None:
     """Refuse options that are out of their range, or contradict each other."""
     given_quantities(options, SETTINGS)
+    if options.at is not None:
+        Answers(options).take({"at": options.at}, "--at")
+    if options.measurement and options.measurement == options.command:
+        raise SelectionError(
+            f"--measurement and --command are both {options.command}: give the topic of the "
+            "sensor, and that of the actuator"
+        )
     if options.web and (options.dry_run or options.json or options.report or options.export):
         raise SelectionError(
             "--web has check, result, report and exports on its page: leave out --dry-run, "
@@ -177,7 +176,15 @@ class Session:
         options, signals = self.options, self.signals
         signals.note(signal.SIGINT)
         self._check_files()
-        if self.kind is not Kind.NODES or options.dry_run:
+        starts = self.kind is not Kind.NODES
+        if starts:
+            # At once, since what follows takes a second to load.
+            what = (options.joint or options.measurement, options.controller or options.command)
+            told = f"looking at {what[0]} and {what[1]}; nothing is commanded yet"
+            print(told, file=sys.stderr, flush=True)
+        with Working("loading what talks to the nodes") if starts else nullcontext():
+            import relay_autotune.nodes.tune_client  # noqa: F401  see Signals
+        if starts or options.dry_run:
             # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.
             signals.obey()
             signals.raise_if_came()

@@ -182,9 +182,12 @@ def test_a_file_that_exists_is_noticed_before_anything_is_looked_at(tmp_path, ca
         ("--output", "gains.yaml", "exists already"),
         ("--export", "gains.yaml", "exists already"),
         ("--output", "none/gains.yaml", "no writable"),
+        ("--report", "tune.txt", "does not say what the report is to be"),
+        ("--report", "none/tune.html", "there is no folder"),
     ):
         assert tune_loop.main([*given, flag, str(tmp_path / name)]) == 2
-        assert told in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert told in said and "looking at" not in said
     assert (tmp_path / "gains.yaml").read_text() == "mine"
 
 
@@ -497,6 +500,8 @@ def test_a_step_without_a_proof_is_refused(
         ("--sample-period 0", "--sample-period is 0, expected above 0 s"),
         ("--amplitude -1", "--amplitude is -1, expected at least 0 u"),
         ("--wait -1", "--wait is -1, expected at least 0 s"),
+        ("--at 7 --command-within 0 5", "--at 7: expected a command from 0 to 5, the limits of"),
+        ("--command /y", "--measurement and --command are both /y: give the topic of the sensor"),
         ("--web-address [::1]:99999", "argument --web-address: '[::1]:99999' is not an address"),
     ],
 )
