@@ -568,10 +568,10 @@ class Code(enum.IntEnum):
     """With path takeover the controller has to be silent before a tune."""
     UNSAFE_COMMAND = _Row(
         311,
-        "safe_command is {value:g}, expected from command_min {low:g} to command_max {high:g}",
-        typed="safe_command COMMAND",
+        "{name} is {value:g}, expected from command_min {low:g} to command_max {high:g}",
+        typed="{name} COMMAND",
     )
-    """safe_command is outside of the command's limits."""
+    """baseline or safe_command is outside of the command's limits."""
     NO_HOLD = _Row(
         312,
         "process_type is {kind}: at a constant command it would {drift} when a tune ends before "

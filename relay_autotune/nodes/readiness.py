@@ -396,10 +396,11 @@ def require_settable(node: Node, changes: Sequence[RosParameter], running: str) 
     else:
         # A start request may still give the amplitude; then all is checked at the start.
         parameters.validate_but_amplitude()
-    # It is sent between tunes, too, where a controller_node in front of the relay ends.
-    safe, low, high = values["safe_command"], parameters.command_min, parameters.command_max
-    if not math.isnan(safe) and not low <= safe <= high:
-        raise NotReadyError(Code.UNSAFE_COMMAND(value=safe, low=low, high=high))
+    low, high = parameters.command_min, parameters.command_max
+    # The latter is sent between tunes, too, where a controller_node in front of the relay ends.
+    for name in ("baseline", "safe_command"):
+        if not math.isnan(value := values[name]) and not low <= value <= high:
+            raise NotReadyError(Code.UNSAFE_COMMAND(name=name, value=value, low=low, high=high))
 
 
 def _rest_of(samples: LastSamples) -> str | Reason:

@@ -164,6 +164,7 @@ def set_parameter(rig: Rig, name: str, value: float) -> Any:
         ("measurement_timeout", math.nan),
         ("bias", math.inf),
         ("baseline", math.inf),
+        ("baseline", 2.5),
     ],
 )
 def test_a_parameter_out_of_range(idle: Rig, name: str, value: float) -> None:
@@ -233,6 +234,11 @@ def test_a_dry_run_says_what_would_be_done_and_moves_nothing(idle: Rig) -> None:
             "relay_node",
             {"safe_command": 20.0, "command_max": 5.0},
             "safe_command is 20, expected from command_min -inf to command_max 5",
+        ),
+        (
+            "relay_node",
+            {"baseline": -1.0, "command_min": 0.0},
+            "baseline is -1, expected from command_min 0 to command_max inf",
         ),
         (
             "relay_node",
