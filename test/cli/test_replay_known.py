@@ -64,10 +64,17 @@ def test_known_facts_reach_the_method(tmp_path, capsys):
     assert model["time_constants"] == pytest.approx([20.0], rel=0.05)
 
 
-def test_a_fact_that_cannot_be_is_one_line(tmp_path, capsys):
-    status, found, err = run(capsys, "--dead-time", "-1", tmp_path / "none")
+@pytest.mark.parametrize(
+    ("fact", "told"),
+    [
+        ("--dead-time -1", "--dead-time is -1, expected at least 0 s"),
+        ("--gain 0", "--gain is 0, expected a gain that is not zero"),
+    ],
+)
+def test_a_fact_that_cannot_be_is_one_line(fact, told, tmp_path, capsys):
+    status, found, err = run(capsys, *fact.split(), tmp_path / "none")
     assert (status, found) == (2, [])
-    assert err == "replay: --dead-time is -1, expected at least 0 s\n"
+    assert err == f"replay: {told}\n"
 
 
 @pytest.mark.parametrize(
@@ -81,11 +88,10 @@ def test_a_fact_that_cannot_be_is_one_line(tmp_path, capsys):
 )
 def test_a_fact_that_the_method_does_not_use_is_refused(tmp_path, capsys, fact, method, uses):
     status, found, err = run(capsys, *fact.split(), "--method", method, tmp_path / "none")
-    name = fact.split()[0].removeprefix("--").replace("-", "_")
     assert (status, found) == (2, [])
     assert err == (
-        f"replay: {name} is not used by the method {method}: leave it out, or name a method that "
-        f"uses it: {uses}\n"
+        f"replay: {fact.split()[0]} is not used by the method {method}: leave it out, or name a "
+        f"method that uses it: {uses}\n"
     )
 
 
