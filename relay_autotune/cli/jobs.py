@@ -130,6 +130,7 @@ def replay(job: Job, working: Working | None = None) -> Done:
     :param working: is told how much of a bag is read, and what the computation is at.
     """
     said: list[str] = []
+    analyses: tuple[Analysis, ...] = ()
     try:
         analyses = analysed(job, said, working)
         if job.export is not None:
@@ -143,7 +144,8 @@ def replay(job: Job, working: Working | None = None) -> Done:
         command = shlex.join(("replay", *job.paths))
         return _failed(job, said, error.told(command), USAGE)
     except RelayAutotuneError as error:
-        return _failed(job, said, str(error), NOTHING_FOUND)
+        # Doubtful gains are there, although they are not exported unasked.
+        return _failed(job, said, str(error), status_of(analyses) or NOTHING_FOUND)
     except Exception as error:
         if os.environ.get(DEBUG):
             raise

@@ -13,6 +13,7 @@ from analysed import completed, doubted
 from report_cases import only
 
 from relay_autotune.analysis import analyse
+from relay_autotune.cli import jobs, replay
 from relay_autotune.cli.arguments import DONE, DOUBTFUL, NOTHING_FOUND, USAGE, worst
 from relay_autotune.cli.jobs import status_of
 from relay_autotune.cli.table import table
@@ -61,6 +62,19 @@ def test_a_doubt_marks_the_gains_in_table_document_page_and_message(monkeypatch)
     )
     fill_gains(message, found.best_gains, judgement=found.judgement)
     assert (message.verdict, message.verdict_reason) == (Verdict.DOUBTFUL, said)
+
+
+def test_doubtful_gains_that_are_not_exported_have_the_status_of_doubtful_gains(
+    monkeypatch, capsys
+):
+    monkeypatch.setattr(jobs, "analysed", lambda *_: (doubted(),))
+    asked = ["--export", "yaml", "bags/biased_relay"]
+    assert replay.main(asked) == DOUBTFUL
+    told = capsys.readouterr()
+    assert not told.out
+    assert "gains are doubtful: the swing is" in told.err
+    assert replay.main([*asked, "--accept-doubtful"]) == DOUBTFUL
+    assert "# DOUBTFUL: the swing is" in capsys.readouterr().out
 
 
 def test_a_failed_check_is_named_beside_the_verdict():
