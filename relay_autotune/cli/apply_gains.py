@@ -10,8 +10,8 @@ half of the swing that the tune made and at least twenty times the noise (forty 
 a third of the way to a limit), as far as the limits of the node allow. If the step fails, or its
 proof is cut short in any way, the node takes the gains before back by itself.
 
-Exit status: 0 the gains are in force and verified (with --file: written); 1 they are not; 2 the
-command line is wrong.
+Exit status: 0 the gains are in force, and verified unless --no-verify or --revert is given (with
+--file: they are written); 1 they are not; 2 the command line is wrong.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def _parser() -> Parser:
         "--step", type=step_height, default=0.0, metavar="Y", help="step of the set-point [y]"
     )
     parser.add_argument(
-        "--load", type=finite, default=0.0, metavar="U",
+        "--load", type=step_height, default=0.0, metavar="U",
         help="a second step, added to the command [u]; the node's verify_load_max must allow it",
     )  # fmt: skip
     parser.add_argument("--yes", action="store_true", help="do not ask")

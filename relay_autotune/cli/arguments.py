@@ -333,12 +333,16 @@ def _address(text: str) -> str:
     return text
 
 
-def check_web() -> None:
-    """Refuse a page where the package that serves it is not installed, before any work is done.
+def check_web(options: argparse.Namespace) -> None:
+    """Refuse a page that cannot be served, or an address without one, before any work is done.
 
-    :raises MissingPackageError: if it is not.
+    :param options: with those of :func:`add_web`.
+    :raises SelectionError: if there is an address alone.
+    :raises MissingPackageError: if the package that serves a page is not installed.
     """
-    if importlib.util.find_spec("tornado") is None:
+    if not options.web and options.web_address != _LOOPBACK:
+        raise SelectionError("--web-address is that of a page: give --web, too")
+    if options.web and importlib.util.find_spec("tornado") is None:
         raise MissingPackageError(
             "--web needs the Python package tornado; install it with: pip install tornado, or "
             "apt install python3-tornado"

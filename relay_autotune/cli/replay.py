@@ -149,8 +149,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
             raise SelectionError(f"{flag} cannot be combined with --output, --jobs or --scheduler")
     if options.report:
         check_output(options.report)
-    if options.web:
-        check_web()
+    check_web(options)
     if options.output:
         return _into_file(jobs, options)
     status = DONE

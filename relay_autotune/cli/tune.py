@@ -508,8 +508,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     rule = options.rule or DEFAULT_RULE
     if rule not in RULES:
         raise SelectionError(f"unknown rule {rule!r}; known: {', '.join(RULES)}")
-    if options.web:
-        check_web()
+    check_web(options)
     asked = design_options(options)
     if asked.law and not asked.sample_period:
         raise SelectionError(

@@ -221,8 +221,7 @@ class Session:
             tell_replaced(PROGRAM, options.report)
         if options.export:
             require_new(options.export)
-        if options.web:
-            check_web()
+        check_web(options)
 
     def _looked_at(self) -> list[Loop]:
         """Look at the loops, and ask for what is not given."""

@@ -100,6 +100,7 @@ class RelayTopics:
         on_result: Callable[[str, Any], None],
         on_status: Callable[[Any], None],
     ) -> None:
+        quality.require_apart(node)
         commands = CommandMessage(
             fixed["command_type"],
             fixed["command_field"],

@@ -177,6 +177,7 @@ class PlantNode(ServedNode):
     def __init__(self) -> None:
         super().__init__("plant_node")
         declare(self, PARAMETERS, read_only=True)
+        quality.require_apart(self)
         values = values_of(self, PARAMETERS)
         self._process = process_from(values)
         self._period: float = values["sample_period"]

@@ -24,6 +24,7 @@ from rclpy.qos import (
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from relay_autotune.bag.writer import Qos
+from relay_autotune.errors import ParameterError
 
 # All of these are reliable, which is rclpy's default as volatile is. A sensor may burst after a
 # stall of some milliseconds; at 1 kHz a depth of 1 loses samples.
@@ -84,6 +85,17 @@ def subscription(node: Node, *what: Any, **options: Any) -> Any:
     """
     silent = SubscriptionEventCallbacks(use_default_callbacks=False)
     return node.create_subscription(*what, event_callbacks=silent, **options)
+
+
+def require_apart(node: Node) -> None:
+    """Refuse one topic for measurement and command: the node would hear itself.
+
+    :param node: that has both.
+    :raises ParameterError: with the topic.
+    """
+    topic = node.resolve_topic_name("measurement")
+    if topic == node.resolve_topic_name("command"):
+        raise ParameterError(f"measurement and command are both {topic}: remap them to two topics")
 
 
 def for_bag(profile: QoSProfile) -> Qos:

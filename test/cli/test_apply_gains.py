@@ -233,6 +233,7 @@ def test_a_step_beyond_the_limits_is_refused_before_anything_changes(
     [
         (("--no-verify", "--step", "1"), "--step and --load are those of the proof"),
         (("--revert", "--load", "0.5"), "--step and --load are those of the proof"),
+        (("--load", "0"), "argument --load: expected a step up or down, found 0"),
         (("--wait", "-1"), "--wait is -1, expected at least 0 s"),
     ],
 )

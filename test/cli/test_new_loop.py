@@ -28,7 +28,7 @@ from rcl_interfaces.srv import SetParametersAtomically
 
 from relay_autotune import reasons as core
 from relay_autotune.bag.definitions import FLOAT64
-from relay_autotune.cli import loops, settings, terminal, tune_loop
+from relay_autotune.cli import loops, replay, settings, terminal, tune_loop
 from relay_autotune.cli.after_tune import AfterTune
 from relay_autotune.cli.loops import Loop, TopicLoop
 from relay_autotune.cli.own_nodes import OwnNodes, namespace_of_joint
@@ -189,6 +189,15 @@ def test_a_file_that_exists_is_noticed_before_anything_is_looked_at(tmp_path, ca
         said = capsys.readouterr().err
         assert told in said and "looking at" not in said
     assert (tmp_path / "gains.yaml").read_text() == "mine"
+
+
+@pytest.mark.parametrize("program", [tune_loop, replay])
+def test_an_address_without_a_page_is_refused(program: Any, capsys) -> None:
+    """It was passed over."""
+    words = ["bags/step_test"] * (program is replay)
+    assert program.main(["--web-address", "0.0.0.0", *words]) == 2
+    told = "--web-address is that of a page: give --web, too\n"
+    assert capsys.readouterr().err == f"{program.PROGRAM}: {told}"
 
 
 class Looker:

@@ -260,6 +260,15 @@ def test_a_bad_parameter_at_the_start_is_one_line(
     assert said in line
 
 
+@pytest.mark.parametrize("executable", ["relay_node", "plant_node"])
+def test_one_topic_for_measurement_and_command_is_refused(rig: Rig, executable: str) -> None:
+    """The node took its own commands for the measurement."""
+    process = rig.start(executable, "-r", "measurement:=command")
+    assert process.wait() == 2
+    said = f"{executable}: measurement and command are both /command: remap them to two topics\n"
+    assert process.log.endswith(said)
+
+
 def test_a_misspelt_name_in_a_file_is_told(rig: Rig) -> None:
     """The name may be meant for another node, so the node only warns."""
     file = rig.folder / "parameters.yaml"
