@@ -66,13 +66,8 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, program: str, **others: Any) -> None:
         super().__init__(program, formatter_class=Help, **others)
-
-    def parse_known_args(self, args: Iterable[str] | None = None, namespace: Any = None) -> Any:
-        """Take a number below zero, such as -1e-3, for a number, not for an option."""
-        given = sys.argv[1:] if args is None else args
-        # An argument that begins with a blank is no option.
-        shown = [f" {each}" if _NEGATIVE.match(each) else each for each in given]
-        return super().parse_known_args(shown, namespace)
+        # Without it -1e-3 is taken for an option.
+        self._negative_number_matcher = _NEGATIVE
 
     def error(self, message: str) -> NoReturn:
         """Refuse the command line, and say where it is read what it takes.
@@ -297,7 +292,7 @@ def as_typed(
 
 
 def _typed(value: Any) -> str:
-    return f"{value:.12g}" if isinstance(value, float) else str(value).strip()
+    return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
 _LOOPBACK = "127.0.0.1"

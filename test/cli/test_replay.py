@@ -591,3 +591,18 @@ def test_numbers_that_json_lacks_are_null():
     assert json_number(1.0 + 0.0j) == 1.0
     assert json_number(1.0 - 2.0j) == [1.0, -2.0]
     assert json_number(np.float64(0.1)) == 0.1
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("--jobs -1", "argument --jobs: expected a number from 1 to 1024, found '-1';"),
+        ("--start -1e-3 --end -2", "--start -0.001 is not before --end -2\n"),
+        ("--end -inf", "argument --end: expected a finite number, found -inf;"),
+    ],
+)
+def test_a_number_below_zero_is_no_option_and_shown_as_it_was_given(words, told, capsys):
+    with pytest.raises(SystemExit) as ended:
+        sys.exit(replay.main([*words.split(), "bags/step_test"]))
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith(f"replay: {told}")
