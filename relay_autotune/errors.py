@@ -137,6 +137,14 @@ def defect(error: BaseException) -> str:
     )
 
 
+def system_says(error: Exception) -> str:
+    """Return what the system says of a file that it refuses, without its number.
+
+    :param error: of the system, or another one.
+    """
+    return getattr(error, "strerror", None) or str(error)
+
+
 T = TypeVar("T")
 
 

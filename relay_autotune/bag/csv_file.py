@@ -36,7 +36,7 @@ from relay_autotune.bag.words import (
     unit_in,
     without_unit,
 )
-from relay_autotune.errors import BagError, NotThereError, SelectionError
+from relay_autotune.errors import BagError, NotThereError, SelectionError, system_says
 
 # Least time that is taken as seconds since 1970: no experiment lasts that long.
 EPOCH = 1.0e8
@@ -103,7 +103,7 @@ def _table(path: Path) -> Iterator[TextTable]:
         with open_regular(path) as file:
             yield TextTable(path, file)
     except OSError as error:
-        raise BagError(f"cannot read {path}: {error.strerror or error}") from error
+        raise BagError(f"cannot read {path}: {system_says(error)}") from error
     except UnicodeError:
         raise BagError(f"{path} is not a text file; expected CSV in UTF-8") from None
     except csv.Error as error:

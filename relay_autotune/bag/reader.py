@@ -18,7 +18,7 @@ from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.signals import CLOCKS, Signal
 from relay_autotune.bag.source import known_start, open_regular
 from relay_autotune.bag.topics import Progress, Topics
-from relay_autotune.errors import BagError, RelayAutotuneError
+from relay_autotune.errors import BagError, RelayAutotuneError, system_says
 
 _STORED = (".mcap", ".db3")
 _TEXTS = (".csv", ".txt", ".dat", ".tsv", ".log")
@@ -154,7 +154,7 @@ def _data_files(path: Path) -> list[Path]:
     try:
         entries = sorted(path.iterdir(), key=_natural)
     except OSError as error:
-        raise BagError(f"cannot read {path}: {error.strerror or error}") from error
+        raise BagError(f"cannot read {path}: {system_says(error)}") from error
     # The folder itself counts: a killed recorder's metadata.yaml is missing or out of date.
     plain = {entry.name for entry in entries if entry.suffix in _STORED}
     # A recorder that was killed while it compressed leaves both.

@@ -26,7 +26,7 @@ from relay_autotune.bag.limits import (
     UNSUSPICIOUS,
 )
 from relay_autotune.bag.mcap_records import RECORD, DamageError
-from relay_autotune.errors import BagError
+from relay_autotune.errors import BagError, system_says
 
 MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format 3\0"
@@ -59,8 +59,7 @@ def open_regular(path: Path) -> BinaryIO:
     except FileNotFoundError:
         raise BagError(f"{path} does not exist; expected a recording") from None
     except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise BagError(f"cannot read {path}: {why}") from error
+        raise BagError(f"cannot read {path}: {system_says(error)}") from error
     if stat.S_ISREG(os.fstat(opened).st_mode):
         return os.fdopen(opened, "rb")
     folder = stat.S_ISDIR(os.fstat(opened).st_mode)
@@ -132,7 +131,7 @@ class Source:
                     break
                 data += more
         except OSError as error:
-            raise BagError(f"cannot read {self.path}: {error.strerror or error}") from error
+            raise BagError(f"cannot read {self.path}: {system_says(error)}") from error
         return data
 
     def count_expanded(self, size: int) -> None:
@@ -231,7 +230,7 @@ class Source:
             # What came before is a recording that ends there.
             self.notes.append(f"{self.path.name} cannot be expanded to its end ({damage})")
         except OSError as error:
-            raise BagError(f"cannot expand {self.path}: {error.strerror or error}") from error
+            raise BagError(f"cannot expand {self.path}: {system_says(error)}") from error
 
 
 def file_records(source: Source, position: int, stop: int) -> Iterator[tuple[int, int, int]]:

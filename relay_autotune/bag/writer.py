@@ -23,7 +23,7 @@ from relay_autotune.bag.definitions import (
     Definition,
     find_definition,
 )
-from relay_autotune.errors import BagError
+from relay_autotune.errors import BagError, system_says
 
 if TYPE_CHECKING:
     from mcap.writer import Writer
@@ -186,7 +186,7 @@ class BagWriter:
         except FileExistsError:
             raise BagError(f"{self.path} exists already, not overwriting") from None
         except OSError as error:
-            raise BagError(f"cannot make the bag {self.path}: {_said(error)}") from error
+            raise BagError(f"cannot make the bag {self.path}: {system_says(error)}") from error
         self._writer, self._channels = self._begin()
         self.flush()
 
@@ -309,7 +309,7 @@ class BagWriter:
         with contextlib.suppress(OSError):
             self._stream.close()
         self._failure = (
-            f"recording to {self.path} has stopped: {_said(error)}; "
+            f"recording to {self.path} has stopped: {system_says(error)}; "
             f"what was written before stays readable"
         )
         return BagError(self._failure)
@@ -359,7 +359,3 @@ class BagWriter:
             with contextlib.suppress(OSError):
                 new.unlink(missing_ok=True)
             raise
-
-
-def _said(error: OSError) -> str:
-    return error.strerror or str(error)

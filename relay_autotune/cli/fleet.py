@@ -29,7 +29,7 @@ from typing import Any, Self
 
 from relay_autotune.cli.arguments import DONE, exit_status, worst
 from relay_autotune.cli.jobs import Done, Job, died, work
-from relay_autotune.errors import BagError, SelectionError
+from relay_autotune.errors import BagError, SelectionError, system_says
 from relay_autotune.exchange.fields import columns
 from relay_autotune.exchange.models import COLUMNS as OF_PROCESS
 from relay_autotune.identification.result import FitReport, Identification
@@ -88,7 +88,7 @@ class ResultsFile:
         try:
             self._file = self.path.open("a+b")
         except OSError as error:
-            raise BagError(f"cannot write {self.path}: {error.strerror or error}") from error
+            raise BagError(f"cannot write {self.path}: {system_says(error)}") from error
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._take_up()
@@ -120,7 +120,7 @@ class ResultsFile:
             self._file.write(document.encode() + b"\n")
             self._file.flush()
         except OSError as error:
-            raise BagError(f"cannot write {self.path}: {error.strerror or error}") from error
+            raise BagError(f"cannot write {self.path}: {system_says(error)}") from error
         self.done.add(name)
 
     def _take_up(self) -> None:
@@ -171,7 +171,7 @@ class ResultsFile:
                 pyarrow.parquet.write_table(table, new)
             new.replace(self._table)
         except OSError as error:
-            raise BagError(f"cannot write {self._table}: {error.strerror or error}") from error
+            raise BagError(f"cannot write {self._table}: {system_says(error)}") from error
 
 
 def rows(document: dict[str, Any]) -> Iterator[dict[str, Any]]:

@@ -33,7 +33,7 @@ from relay_autotune.cli.arguments import (
 )
 from relay_autotune.cli.jobs import Job, add_analysis, add_details, analysed, jobs_of, present_of
 from relay_autotune.cli.terminal import Working
-from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError
+from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError, system_says
 from relay_autotune.report import PICTURES, is_ours, write_figures, write_page, write_picture
 
 if TYPE_CHECKING:
@@ -129,7 +129,8 @@ def _run(options: argparse.Namespace) -> int:
             for path in write_figures(cases, options.figures, options.format):
                 print(path)
         except OSError as error:
-            raise BagError(f"the figures cannot be written: {error}") from error
+            folder, why = options.figures, system_says(error)
+            raise BagError(f"the figures cannot be written to {folder}: {why}") from error
     return status
 
 
@@ -191,7 +192,7 @@ def check_output(output: str) -> None:
             pass
     except OSError as error:
         raise SelectionError(
-            f"the report {path} cannot be written: {error.strerror}; name another file"
+            f"the report {path} cannot be written: {system_says(error)}; name another file"
         ) from error
     if not existed:
         path.unlink()
@@ -221,7 +222,7 @@ def write_report(cases: Sequence[Case], output: str, *, title: str = "") -> None
         else:
             write_picture(cases[0], output, title=title)
     except OSError as error:
-        raise BagError(f"the report cannot be written: {error}") from error
+        raise BagError(f"the report {output} cannot be written: {system_says(error)}") from error
 
 
 _Source = tuple[tuple[str, ...], Callable[[], Sequence["Case"]]]

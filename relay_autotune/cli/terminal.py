@@ -21,7 +21,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError
+from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError, system_says
 from relay_autotune.text import LOGGED_EVERY, TOLD_EVERY, duration, in_units, visible
 
 if TYPE_CHECKING:
@@ -192,7 +192,7 @@ def write(text: str, path: str | None) -> None:
     except FileExistsError as error:
         raise SelectionError(f"{path} exists already, not overwriting it") from error
     except OSError as error:
-        raise SelectionError(f"{path} cannot be written: {error.strerror}") from error
+        raise SelectionError(f"{path} cannot be written: {system_says(error)}") from error
 
 
 # Time after which a terminal is first told what is being done [s]: several short works in a row

@@ -31,6 +31,7 @@ from relay_autotune.errors import (
     ParameterError,
     RelayAutotuneError,
     TuningError,
+    system_says,
 )
 from relay_autotune.exchange.export import TOPICS
 from relay_autotune.exchange.messages import why_doubtful
@@ -91,7 +92,7 @@ def _topics(file: str) -> dict[str, str]:
         own = any("kc" in values for values in sections.values())
         topics = sections.get(TOPICS, {}).items()
     except (OSError, UnicodeDecodeError) as error:
-        raise ParameterError(f"{FLAG} {file}: it cannot be read ({error})") from None
+        raise ParameterError(f"{FLAG} {file}: it cannot be read ({system_says(error)})") from None
     except (yaml.YAMLError, AttributeError, KeyError, TypeError):
         own = False
     if not own:

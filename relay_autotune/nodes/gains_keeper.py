@@ -35,7 +35,7 @@ from relay_autotune.control.gains_history import (
     Standing,
     Work,
 )
-from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.errors import RelayAutotuneError, system_says
 from relay_autotune.nodes.gains_place import Place, controller_text
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.reasons import Code, reason_of
@@ -111,7 +111,7 @@ class GainsJournal:
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
-            raise _unreadable(path, str(error)) from error
+            raise _unreadable(path, system_says(error)) from error
         if len(text) > _LARGEST:
             raise _unreadable(path, f"it has more than {_LARGEST} bytes")
         try:
@@ -164,7 +164,7 @@ class GainsJournal:
                 with contextlib.suppress(OSError):
                     new.unlink(missing_ok=True)
                 raise JournalError(
-                    f"the gains cannot be kept in {self.path}: {error.strerror or error}; make "
+                    f"the gains cannot be kept in {self.path}: {system_says(error)}; make "
                     "the folder writable, or give another record_directory"
                 ) from error
 

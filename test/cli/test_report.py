@@ -207,6 +207,8 @@ def test_present_gains_and_the_command_are_in_the_report(
     text = page.read_text()
     assert "Beside the present gains" in text
     assert f"report {result} -o {page} --present 0.3 20 0" in text
+    status, _, err = run(capsys, result, "-o", page, "--figures", page)
+    assert (status, f"cannot be written to {page}: File exists\n" in err) == (1, True)
     drawn: list[Any] = []
     monkeypatch.setattr(report, "write_figures", lambda cases, *_: drawn.extend(cases) or [])
     given = ("--present", "0.3", "20", "0")
