@@ -138,9 +138,11 @@ class GainsPage:
         """Yield the lines of a plan that say which gains are there, and which come."""
         after = ""
         if not self.loop.proves:
-            self._found()
+            controller = self._found()
             yield "", "now", f"{self.live.told.controller} has {self.live.told.present}"
             after = "; at once, without a bump of the command"
+            if message is not None:
+                controller.require_new(message)
         if message is not None:
             yield "", "new gains", f"{gains_words(gains_from_message(message))}{after}"
             if doubt := why_doubtful(message):

@@ -151,6 +151,15 @@ class GainsClient(LoopClient):
         wanted = {place: getattr(gains, name) for name, place in places.items()}
         return GainSet.of(self.values(node, list(wanted))).is_near(GainSet.of(wanted))
 
+    def require_new(self, message: Any) -> None:
+        """Refuse gains that are in force already.
+
+        :param message: the `PidGains`.
+        :raises LoopError: if they are.
+        """
+        if self.has(gains_from_message(message)):
+            raise LoopError("these gains are in force already")
+
     @contextmanager
     def _offered(self, message: Any) -> Iterator[None]:
         """Offer gains as identifier_node does until the end of the block.
@@ -161,8 +170,7 @@ class GainsClient(LoopClient):
         :param message: the `PidGains`.
         :raises LoopError: if they are in force already.
         """
-        if self.has(gains_from_message(message)):
-            raise LoopError("these gains are in force already")
+        self.require_new(message)
         self.call(Trigger, f"{self.name}/discard", Trigger.Request())
         kind = "relay_autotune_msgs/msg/PidGains"
         topic = self._topic_of(self.name, "pi_gains", kind, published=False)

@@ -404,7 +404,8 @@ def test_the_page_refuses_a_step_beyond_the_limits_before_anything_changes() -> 
         in_force=lambda: Controller(0.1, 3.0), steps=lambda gains: StepsWithin(2.0),
         prove=lambda *words: changed.append(words),
         name="/controller_node", find=lambda patience: None, steps_of=lambda result: [],
-        allowing=lambda **least: nullcontext(),
+        allowing=lambda **least: nullcontext(), has=lambda gains: False,
+        require_new=lambda message: GainsClient.require_new(controller, message),
     )  # fmt: skip
     loop: Any = SimpleNamespace(
         proves=False, client=SimpleNamespace(controllers=lambda: ["/controller_node"])
@@ -426,6 +427,9 @@ def test_the_page_refuses_a_step_beyond_the_limits_before_anything_changes() -> 
         # not a range of the measurement
         assert ("", "steps", StepRange(-1.5, 2.0).words) in usual.lines
     assert not changed
+    # a step with gains that are there would take the chart of the one before away
+    controller.has = lambda gains: True
+    assert page.plan(PageCommand(PROVE, dry=3)).refusal == "these gains are in force already"
     # what takes them back is a button of the page, not another command
     controller.prove = lambda *words: Verify.Result(passed=True, steps=[step()])
     page.do(PageCommand(VERIFY, step=1.0))
