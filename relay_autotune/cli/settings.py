@@ -124,7 +124,7 @@ SETTINGS = (
     Setting("namespace", "", metavar="NS", loops=_COMMAND).means(
         "namespace of the loop; with --web several, separated by commas"
     ),
-    Setting("node", "relay_node", metavar="NAME", loops=_COMMAND).means(
+    Setting("node", "relay_node", metavar="NAME", loops=(Kind.NODES,)).means(
         "name of the relay_node (%(default)s)"
     ),
     Setting("record_only", False, loops=_COMMAND).means(
@@ -496,7 +496,9 @@ def kind_of(options: argparse.Namespace) -> Kind:
     for each in SETTINGS:
         if kind in each.loops or not each.is_given(options):
             continue
-        if kind in _JOINTS:
+        if each.loops == (Kind.NODES,):
+            told = "nodes that run already: leave it out"
+        elif kind in _JOINTS:
             what = "--open" if Kind.OPENED in each.loops else "a loop of two topics"
             told = f"{what}: leave it out, since the controller tells it"
         elif Kind.TOPICS in each.loops:

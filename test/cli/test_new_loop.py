@@ -764,6 +764,9 @@ def test_what_was_typed_before_a_question_moves_nothing(
 
 def test_flags_of_a_new_loop_need_both_topics() -> None:
     assert kind_of(options()) is Kind.TOPICS
+    # Those of the command have their own names: another one was waited for in vain.
+    with pytest.raises(SelectionError, match=r"--node is for nodes that run already: leave it"):
+        kind_of(options("--node", "other"))
     given = options("--within", "1", "9")
     given.command = None
     with pytest.raises(SelectionError, match=r"--measurement .*: give --command, too"):
