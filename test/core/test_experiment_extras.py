@@ -170,6 +170,24 @@ def test_of_both_levels_clipped_alike_only_gains_that_hold_are_trusted(known, sh
         assert hold or found.verdict is not Verdict.TRUSTED
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_levels_that_the_actuator_does_not_reach_show_beside_the_smaller_ones(seed):
+    """The gains have to hold before and after the last growth: their Ms had been up to 1.49."""
+    process, end = TransferFunction.fopdt(2.0, 0.5, 0.16), 0.3
+    tune = experiment(amplitude=0.0, command_min=-3.0, command_max=3.0)
+    plant, noise, command = Plant(process), gaussian(0.009, seed), 0.0
+    for k in range(20_000):
+        y = plant.advance(0.02 * k, min(max(command, -end), end)) + noise()
+        command = tune.step(0.02 * k, y)
+        if tune.finished:
+            break
+    assert tune.outcome is Outcome.COMPLETED, tune.reason
+    assert tune.settings.high > 1.2 * end
+    found = analyse(tune.record(), alone=True)
+    assert any("two halves of the record" in told for told in found.model.warnings)
+    assert Loop(found.best_gains, process).ms() < 1.42
+
+
 def test_a_first_amplitude_that_cannot_leave_the_band_is_made_larger_soon():
     """The loop still moves while it settles, so that its noise is taken for too large."""
     given = ExperimentParameters(amplitude=0.5, settle_time=0.1, process_gain_sign=1)

@@ -38,11 +38,15 @@ from relay_autotune.identification.waveform.separable import (
 )
 from relay_autotune.process.structures import Structure
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.record import PiecewiseConstant
 
 # Samples at which draws are compared with the fit, and those of both halves together.
 _MOST_SAMPLES, _MOST_OF_HALVES = 600, 2400
 # Least number of samples in a half that is asked for models of its own.
 _FEWEST = 24
+# Share of its farthest level from which a command has its full reach, and least share of the
+# information that a part of the record has to hold.
+_FULL, _LEAST_TOLD = 0.99, 0.05
 # Gauss-Newton steps to the most likely point, halvings of each, and the relative gain that ends
 # them: the draws need it to a small part of a standard deviation.
 _STEPS, _HALVINGS, _SETTLED = 10, 4, 1e-3
@@ -179,7 +183,9 @@ def _draws(
 def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part, ...]:
     """Return the models that each half of a record allows in the chosen structure.
 
-    The halves hold equal information on the parameters. Each has its own offset and free initial
+    They meet where the command first has its full reach: an actuator at its end, or a process that
+    is not linear, answers large moves otherwise than small ones. Where one of them would tell
+    little, they hold equal information on the parameters. Each has its own offset and free initial
     state, the first one only where the whole record has one. One that its own models do not
     explain, such as a rest after all responses, tells nothing.
     """
@@ -193,7 +199,9 @@ def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part,
     size = np.einsum("pn,pn->p", jacobian, jacobian)
     size[size == 0.0] = 1.0
     information = np.cumsum(np.sum(jacobian**2 / size[:, None], axis=0))
-    middle = int(np.searchsorted(information, 0.5 * information[-1]))
+    middle = _full_reach(problem)
+    if not _LEAST_TOLD < information[middle] / information[-1] < 1.0 - _LEAST_TOLD:
+        middle = int(np.searchsorted(information, 0.5 * information[-1]))
     if min(middle, problem.time.size - middle) < max(_FEWEST, 4 * state.parameters):
         return ()
     second = problem.part(slice(middle, None))
@@ -211,6 +219,15 @@ def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part,
             ends = float(part.time[0]), float(part.time[-1])
             parts.append(Part(*ends, found.models, found.excludes_known))
     return tuple(parts)
+
+
+def _full_reach(problem: Problem) -> int:
+    """Return where a held command is first as far from its first level as it comes; 0: a ramp."""
+    u = problem.inputs[0]
+    if not isinstance(u, PiecewiseConstant):
+        return 0
+    reach = np.abs(u(problem.time) - u.initial)
+    return int(np.argmax(reach >= _FULL * reach.max()))
 
 
 def _apart(halves: Sequence[Part], frequency: float) -> float:
