@@ -28,6 +28,12 @@ def start(module: str, told_for: tuple[str, ...] = ()) -> int:
     :param told_for: arguments with which it says first that it loads, for people wait for it.
     :return: the exit status.
     """
+    # A process that was started with SIGINT ignored, as by nohup, keeps ignoring it.
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        # Block SIGINT during the change: a signal noted for the old handler would be lost.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     # If an output is closed, the next opened file would get its number and all its text. So
     # occupy the numbers up to 2.
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
@@ -43,12 +49,6 @@ def start(module: str, told_for: tuple[str, ...] = ()) -> int:
             return 1
         sys.stderr.write(f"{name} is loading; nothing is commanded yet\n")
         sys.stderr.flush()
-    # A process that was started with SIGINT ignored, as by nohup, keeps ignoring it.
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        # Block SIGINT during the change: a signal noted for the old handler would be lost.
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
         status: int = import_module(module).main()
     except ModuleNotFoundError as error:
