@@ -250,7 +250,8 @@ def test_a_topic_that_is_not_there_is_told_with_what_may_be_meant(
     rig: Rig, topic: str, meant: str
 ) -> None:
     rig.start("plant_node", *TOPICS, **FAST)
-    words = [word.replace("/tank/level", topic) for word in WORDS]
+    # The command is given as the measurement where that is given as the command.
+    words = [{"/tank/level": topic, topic: "/tank/level"}.get(word, word) for word in WORDS]
     done = subprocess.run(
         [shutil.which("tune_loop"), *words, "--wait", "6"],
         env=rig.environment, capture_output=True, text=True, timeout=60.0, check=False,
