@@ -175,15 +175,17 @@ class Loop:
         # A relay_node of an older version sends no reasons.
         reasons = map(reason_from_message, result.refusals)
         return [
-            f"{check}; {self.to_type(why)}" if why is not None and why.typed else check
+            "; ".join(filter(None, (check, self.to_type(why) if why is not None else "")))
             for check, why in zip_longest(result.checks, reasons)
         ]
 
     def to_type(self, why: Reason) -> str:
-        """Return what sets the parameter that a reason names."""
+        """Return what sets the parameter that a reason names; empty: nothing that can be given."""
         name, _, value = why.typed.partition(" ")
-        if name in FLAGS or self.has_own_nodes:
-            return f"give {FLAGS.get(name, name)}"
+        if name in FLAGS:
+            return f"give {FLAGS[name]}"
+        if not name or self.has_own_nodes:
+            return ""
         return typed_for_parameter(self.client.name, name, value)
 
     @contextmanager
@@ -242,9 +244,10 @@ class Loop:
                 face.say("cancelling: the safe command goes out, then the recording is closed")
             elif any(number != signal.SIGHUP for number in interrupted[1:]):
                 # SIGHUP does not count: a shell that ends with its terminal sends it once more.
+                sender = "its node, which ends," if self.has_own_nodes else client.name
                 raise LoopError(
-                    f"stopped waiting; {client.name} still sends the safe command, and its log "
-                    f"says how the tune ended"
+                    f"stopped waiting; {sender} still sends {self.safe_command}, and its log says "
+                    f"how the tune ended"
                 )
 
     @property

@@ -461,6 +461,8 @@ def test_what_failed_names_the_flag_and_no_node_that_ends_with_the_command() -> 
     assert other.checklist(answer) == [limits, *answer.checks[1:]]
     free = Code.LITTLE_SPACE(folder="/", free=0.1)
     assert "relay_node" in other.to_type(free) and "record_directory" in other.to_type(free)
+    # It has no flag, and the node is not there to be told.
+    assert own.to_type(free) == ""
     # Another node's reason may lack a value.
     answer.refusals[0].names = answer.refusals[0].values = []
     assert own.checklist(answer) == answer.checks
