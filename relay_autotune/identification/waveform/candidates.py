@@ -49,7 +49,6 @@ from relay_autotune.identification.waveform.starts import (
 from relay_autotune.process.structures import (
     FOPDT,
     INTEGRATOR_INVERSE,
-    IPDT,
     LAG_COMPLEX,
     SOPDT_ZERO,
     TABLE,
@@ -261,32 +260,32 @@ class FitContext:
 
         :param candidate: in white noise.
         """
-        return [each for terms in self.terms for each in self.with_terms(candidate, terms)]
+        found = (self.with_term(candidate, term) for term in self.terms)
+        return [each for each in found if each is not None]
 
-    def with_terms(self, candidate: Candidate, terms: tuple[str, ...]) -> list[Candidate]:
-        """Return a candidate with further terms beside the model; none where it has no such.
+    def with_term(self, candidate: Candidate, term: str) -> Candidate | None:
+        """Return a candidate with a further term beside the model; None where it has no such.
 
         :param candidate: in white noise.
-        :param terms: some of ``TERMS``.
+        :param term: one of ``TERMS``.
         """
-        if all(nuisances_of(candidate.problem, terms)):
-            return []
-        if "relaxation" in terms and not candidate.structure.factors:
+        if nuisances_of(candidate.problem, (term,))[0]:
+            return None
+        if term == "relaxation" and not candidate.structure.factors:
             # The free state of an integrator is the offset.
-            return []
-        if "friction" in terms and not candidate.structure.integrators:
+            return None
+        if term == "friction" and not candidate.structure.integrators:
             # It acts against the motion of a position.
-            return []
-        if terms == ("load",):
+            return None
+        if term == "load":
             problem, state = with_load(candidate.problem, candidate.state)
         else:
-            changed: dict[str, Any] = dict.fromkeys(terms, True)
+            changed: dict[str, Any] = {term: True}
             problem = replace(candidate.problem, **changed)
             state = _refined(problem, candidate.state)
-            if not _BEFORE.isdisjoint(terms):
+            if term in _BEFORE:
                 state = self._out_of_a_wrong_minimum(problem, state)
-        other = self.candidate(problem, state)
-        return [] if other is None else [other]
+        return self.candidate(problem, state)
 
     def _out_of_a_wrong_minimum(self, problem: Problem, state: Trial) -> Trial:
         """Return a fit with a further term, begun anew where a FOPDT explains more.
@@ -324,8 +323,8 @@ class FitContext:
         return self._fopdts[key]
 
     @cached_property
-    def terms(self) -> list[tuple[str, ...]]:
-        """Names of the terms beside the model that the record may need, alone or together."""
+    def terms(self) -> list[str]:
+        """Names of the terms beside the model that the record may need."""
         rested = needs_no_past(self.problem, self.sign)
         needed = {
             "drift": True,
@@ -336,9 +335,7 @@ class FitContext:
             "load": self.loads and len(self.problem.bounds) == 1,
             "friction": self.held and bool(self.problem.motions),
         }
-        alone: list[tuple[str, ...]] = [(term,) for term in TERMS if needed[term]]
-        # Of a movement before the record, either part alone may explain nothing.
-        return [*alone, ("relaxation", "past")] if needed["past"] else alone
+        return [term for term in TERMS if needed[term]]
 
     def with_nuisances_of(self, candidate: Candidate) -> FitContext:
         """Return the context with the terms beside the model of a candidate.
@@ -423,9 +420,6 @@ class FitContext:
         problem = replace(self.problem, structure=structure)
         if structure == UNSTABLE_FOPDT:
             return self.unstable
-        if structure == IPDT:
-            # A command off its balance leaves a drift, which is a term of its own.
-            least = math.inf
         return multistart(problem, self._starts(self.guess, structure), least)
 
 
