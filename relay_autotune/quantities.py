@@ -51,6 +51,7 @@ class Quantity:
     :param lower: smallest value allowed.
     :param upper: largest value allowed.
     :param open_ended: True if ``lower`` and ``upper`` themselves are not allowed.
+    :param zero: False if 0 is not allowed.
     :param choices: the allowed words, for a text; (): any text.
     :param flag: its name on the command line; empty: ``name``.
     :param description: one sentence for people.
@@ -62,6 +63,7 @@ class Quantity:
     lower: float = -math.inf
     upper: float = math.inf
     open_ended: bool = False
+    zero: bool = True
     choices: tuple[str, ...] = ()
     flag: str = ""
     description: str = ""
@@ -98,7 +100,7 @@ class Quantity:
             text = f"between {self.lower:g} and {self.upper:g}{unit}"
         else:
             text = f"from {self.lower:g} to {self.upper:g}{unit}"
-        return text + self._or_not_given
+        return text + " but 0" * (not self.zero) + self._or_not_given
 
     @property
     def _or_not_given(self) -> str:
@@ -152,6 +154,8 @@ class Quantity:
     def _includes(self, value: float) -> bool:
         if math.isnan(value):
             return self.default != self.default
+        if value == 0.0 and not self.zero:
+            return False
         if self.open_ended:
             return self.lower < value < self.upper
         return self.lower <= value <= self.upper

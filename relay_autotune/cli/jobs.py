@@ -28,7 +28,6 @@ from relay_autotune.cli.arguments import (
     as_typed,
     exit_status,
     finite,
-    flag_of,
     given_quantities,
     say,
 )
@@ -489,10 +488,7 @@ def jobs_of(
         known = Known(**given_quantities(options, declared(Known)))
         task = Task(options.method, options.rule, known, design_options(options))
     except RelayAutotuneError as error:
-        # Some begin with the name of a known value.
-        flags = {each.name: flag_of(each) for each in declared(Known)}
-        first, blank, others = str(error).partition(" ")
-        raise SelectionError(flags.get(first, first) + blank + others) from error
+        raise SelectionError(str(error)) from error
     start, end = options.start, options.end
     if start is not None and end is not None and start >= end:
         raise SelectionError(f"--start {start:g} is not before --end {end:g}")

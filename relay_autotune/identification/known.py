@@ -28,7 +28,7 @@ class Known:
     :raises ParameterError: if a value is out of its range, or the gain is zero.
     """
 
-    gain: float = quantity(math.nan, "y/u").means(
+    gain: float = quantity(math.nan, "y/u", zero=False).means(
         "Static gain of the process, in y/(u s) if it integrates; NaN: to be found, which atv, "
         "and chang with unequal lags, cannot do."
     )
@@ -47,8 +47,6 @@ class Known:
 
     def __post_init__(self) -> None:
         check(self, ParameterError)
-        if self.gain == 0.0:
-            raise ParameterError("gain is 0, expected a gain that is not zero")
 
 
 NOTHING = Known()

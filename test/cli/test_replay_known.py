@@ -68,7 +68,7 @@ def test_known_facts_reach_the_method(tmp_path, capsys):
     ("fact", "told"),
     [
         ("--dead-time -1", "--dead-time is -1, expected at least 0 s"),
-        ("--gain 0", "--gain is 0, expected a gain that is not zero"),
+        ("--gain 0", "--gain is 0, expected any number [y/u] but 0"),
     ],
 )
 def test_a_fact_that_cannot_be_is_one_line(fact, told, tmp_path, capsys):
@@ -88,10 +88,11 @@ def test_a_fact_that_cannot_be_is_one_line(fact, told, tmp_path, capsys):
 )
 def test_a_fact_that_the_method_does_not_use_is_refused(tmp_path, capsys, fact, method, uses):
     status, found, err = run(capsys, *fact.split(), "--method", method, tmp_path / "none")
+    name = fact.split()[0].removeprefix("--").replace("-", "_")
     assert (status, found) == (2, [])
     assert err == (
-        f"replay: {fact.split()[0]} is not used by the method {method}: leave it out, or name a "
-        f"method that uses it: {uses}\n"
+        f"replay: {name} is not used by the method {method}: leave it out, or name a method that "
+        f"uses it: {uses}\n"
     )
 
 
