@@ -303,7 +303,7 @@ def test_gains_for_a_period_in_milliseconds_do_not_blame_the_recording(tmp_path,
     path = step_csv(tmp_path / "step.csv")
     asked = ("--export", "oscat_ft_pid", "--sample-period", "500")
     status, _, err = run(capsys, *FOPDT, *asked, path)
-    assert status == 1
+    assert status == 3
     assert "the controller runs every 500 s, the recording has a sample every 0.5 s" in err
     assert "is the sampling period in seconds?" in err and "record for longer" not in err
 
