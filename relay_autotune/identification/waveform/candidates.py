@@ -260,32 +260,32 @@ class FitContext:
 
         :param candidate: in white noise.
         """
-        found = (self.with_term(candidate, term) for term in self.terms)
-        return [each for each in found if each is not None]
+        return [each for terms in self.terms for each in self.with_terms(candidate, terms)]
 
-    def with_term(self, candidate: Candidate, term: str) -> Candidate | None:
-        """Return a candidate with a further term beside the model; None where it has no such.
+    def with_terms(self, candidate: Candidate, terms: tuple[str, ...]) -> list[Candidate]:
+        """Return a candidate with further terms beside the model; none where it has no such.
 
         :param candidate: in white noise.
-        :param term: one of ``TERMS``.
+        :param terms: some of ``TERMS``.
         """
-        if nuisances_of(candidate.problem, (term,))[0]:
-            return None
-        if term == "relaxation" and not candidate.structure.factors:
+        if all(nuisances_of(candidate.problem, terms)):
+            return []
+        if "relaxation" in terms and not candidate.structure.factors:
             # The free state of an integrator is the offset.
-            return None
-        if term == "friction" and not candidate.structure.integrators:
+            return []
+        if "friction" in terms and not candidate.structure.integrators:
             # It acts against the motion of a position.
-            return None
-        if term == "load":
+            return []
+        if terms == ("load",):
             problem, state = with_load(candidate.problem, candidate.state)
         else:
-            changed: dict[str, Any] = {term: True}
+            changed: dict[str, Any] = dict.fromkeys(terms, True)
             problem = replace(candidate.problem, **changed)
             state = _refined(problem, candidate.state)
-            if term in _BEFORE:
+            if not _BEFORE.isdisjoint(terms):
                 state = self._out_of_a_wrong_minimum(problem, state)
-        return self.candidate(problem, state)
+        other = self.candidate(problem, state)
+        return [] if other is None else [other]
 
     def _out_of_a_wrong_minimum(self, problem: Problem, state: Trial) -> Trial:
         """Return a fit with a further term, begun anew where a FOPDT explains more.
@@ -323,8 +323,8 @@ class FitContext:
         return self._fopdts[key]
 
     @cached_property
-    def terms(self) -> list[str]:
-        """Names of the terms beside the model that the record may need."""
+    def terms(self) -> list[tuple[str, ...]]:
+        """Names of the terms beside the model that the record may need, alone or together."""
         rested = needs_no_past(self.problem, self.sign)
         needed = {
             "drift": True,
@@ -335,7 +335,9 @@ class FitContext:
             "load": self.loads and len(self.problem.bounds) == 1,
             "friction": self.held and bool(self.problem.motions),
         }
-        return [term for term in TERMS if needed[term]]
+        alone: list[tuple[str, ...]] = [(term,) for term in TERMS if needed[term]]
+        # Of a movement before the record, either part alone may explain nothing.
+        return [*alone, ("relaxation", "past")] if needed["past"] else alone
 
     def with_nuisances_of(self, candidate: Candidate) -> FitContext:
         """Return the context with the terms beside the model of a candidate.

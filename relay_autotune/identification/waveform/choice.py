@@ -317,9 +317,11 @@ def _with_a_load(
     :param simple: some of them in white noise, without any terms.
     """
     best = context.refit(found[0], None)
-    without = [*simple, *([] if best is None else [best])]
-    tried = (context.with_term(each, "load") for each in without)
-    loaded = [each for each in tried if each is not None]
+    loaded = [
+        each
+        for without in (*simple, *([] if best is None else [best]))
+        for each in context.with_terms(without, ("load",))
+    ]
     if not loaded:
         return found
     decided = _with_best_terms(context, [min(loaded, key=lambda c: c.score)])
