@@ -187,7 +187,8 @@ def test_an_experiment_that_did_not_end_well_has_a_model_but_no_gains(tmp_path, 
     assert experiment["reason"] == "the operator pressed the button"
     status, out, err = run(capsys, *FOPDT, tmp_path / "bag")
     assert status == 1
-    assert (out + err).count("the operator pressed the button") == 1
+    # A line may end within it.
+    assert " ".join((out + err).split()).count("the operator pressed the button") == 1
     assert re.search(r"^  verdict +none$", out, re.M)
     assert "ISA form" not in out
 
