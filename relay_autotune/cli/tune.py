@@ -13,8 +13,9 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -271,26 +272,32 @@ class _Designs:
     :param task: what is designed.
     :param rule: the rule that was asked for.
     :param form: in which gains are shown: "isa", "parallel" or "series".
-    :param gains: those of the rules that apply, the chosen one's first.
-    :param refused: by name, why a rule gives none.
+    :param every: whether all rules are asked, beside that one.
+    :raises TuningError: if that one is asked alone, and gives none.
     """
 
     task: DesignTask
     rule: str
     form: str
-    gains: list[Gains] = field(default_factory=list)
-    refused: dict[str, str] = field(default_factory=dict)
+    every: bool
 
-    @classmethod
-    def by_all_rules(cls, task: DesignTask, rule: str, form: str) -> _Designs:
-        """Return the gains of every rule."""
-        found = cls(task, rule, form)
-        for name in sorted(RULES, key=lambda n: n != rule):
-            try:
-                found.gains.append(design(task, name))
-            except TuningError as error:
-                found.refused[name] = str(error)
-        return found
+    def __post_init__(self) -> None:
+        # Those of the rules that apply, the chosen one's first; by name, why a rule gives none.
+        self.gains: list[Gains] = []
+        self.refused: dict[str, str] = {}
+        for name in sorted(RULES, key=lambda n: n != self.rule) if self.every else [self.rule]:
+            with self._refusing(name):
+                self.gains.append(design(self.task, name))
+
+    @contextmanager
+    def _refusing(self, name: str) -> Iterator[None]:
+        """Note that a rule gives no gains, where others are asked, too."""
+        try:
+            yield
+        except TuningError as error:
+            if not self.every:
+                raise
+            self.refused[name] = str(error)
 
     @property
     def recommended(self) -> int | None:
@@ -301,23 +308,26 @@ class _Designs:
     def inside(self) -> list[tuple[Compensator, Performance]]:
         """Controllers with a model inside, each with what it does; others are noted as refused."""
         found, task = [], self.task
-        for name, make in COMPENSATORS.items():
-            try:
+        for name, make in COMPENSATORS.items() if self.every else ():
+            with self._refusing(name):
                 made = make(task)
                 found.append((made, analyse_loop(made.law, task.process)))
-            except TuningError as error:
-                self.refused[name] = str(error)
         return found
 
-    def one(self) -> list[str]:
-        """Return the only gains in full, as lines.
+    def lines(self) -> list[str]:
+        """Return the process with the only gains in full, or with all rules side by side.
 
-        :raises TuningError: if they do not have the form.
+        :raises TuningError: if the only gains do not have the form.
         """
-        (gains,) = self.gains
-        return [*self._process(), *gains_lines(gains, width=width(), form=self.form)]
+        model, options = self.task.model, self.task.options
+        lines = labelled("process", f"{process_text(model)}   ({model.structure})", width())
+        if options.law:
+            lines += labelled("law", f"{options.law} every {options.sample_period:g} s", width())
+        if not self.every:
+            return [*lines, "", *gains_lines(self.gains[0], width=width(), form=self.form)]
+        return [*lines, "", *self._side_by_side()]
 
-    def side_by_side(self) -> list[str]:
+    def _side_by_side(self) -> list[str]:
         """Return a line for each rule and each controller with a model inside, and why not."""
         rows: list[tuple[str, ...]] = []
         if self.gains:
@@ -335,7 +345,7 @@ class _Designs:
                 numbers = digits(compensator.closed_loop_time), digits(found.delay_margin, 3), ""
                 rows.append((f"  {compensator.name}", *numbers, *_judged(found)))
             rows.append(("", "s", "s", "", *_UNITS_JUDGED))
-        lines = [*self._process(), *in_columns(rows, width())]
+        lines = in_columns(rows, width())
         if self.refused:
             lines += ["", "  no gains by"]
         indent = max(map(len, self.refused), default=0) + 6
@@ -343,17 +353,15 @@ class _Designs:
             lines += labelled(f"  {name}", why, width(), indent=indent)
         return lines
 
-    def document(self, *, every: bool) -> dict[str, Any]:
+    def document(self) -> dict[str, Any]:
         """Return the gains as a document.
 
-        :param every: whether all rules were asked, of which some may have no such form.
-        :raises TuningError: if gains that were asked for by their rule do not have the form.
+        :raises TuningError: if the only gains do not have the form.
         """
-        model = self.task.model
-        inside = self.inside if every else []
+        inside = self.inside
         found: dict[str, Any] = {
-            "model": model_fields(model),
-            "gains": [self._fields(each, every=every) for each in self.gains],
+            "model": model_fields(self.task.model),
+            "gains": [self._fields(each) for each in self.gains],
             "recommended": self.recommended,
             "refused": self.refused,
         }
@@ -382,14 +390,6 @@ class _Designs:
             added_delay=self.task.options.added_delay,
         )
 
-    def _process(self) -> list[str]:
-        """Return the process that is tuned for, and the law, if one was named."""
-        model, options = self.task.model, self.task.options
-        lines = labelled("process", f"{process_text(model)}   ({model.structure})", width())
-        if options.law:
-            lines += labelled("law", f"{options.law} every {options.sample_period:g} s", width())
-        return [*lines, ""]
-
     def _in_form(self, gains: Gains) -> tuple[str, ...]:
         try:
             found = series_form(gains) if self.form == "series" else gains
@@ -397,13 +397,13 @@ class _Designs:
             return "no", "series", "form"
         return tuple(digits(getattr(found, name)) for name in _NUMBERS[self.form])
 
-    def _fields(self, gains: Gains, *, every: bool) -> dict[str, Any]:
+    def _fields(self, gains: Gains) -> dict[str, Any]:
         fields = to_document(gains)
         if self.form == "series":
             try:
                 fields["series"] = dict(vars(series_form(gains)))
             except TuningError as error:
-                if not every:
+                if not self.every:
                     raise
                 fields["series"] = {"reason": str(error)}
         return fields
@@ -515,34 +515,19 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
             f"{asked.law} runs at a sampling period: give it with --sample-period S"
         )
     task = task_of_model(model_of(options), asked)
-    if options.table or options.web:
-        every = _Designs.by_all_rules(task, rule, options.form)
-    status = _told(every, options) if options.table else _one(task, rule, options)
-    if options.web:
-        show(PROGRAM, parser, options, [(every.case(), Shaping(task))])
-    return status
-
-
-def _one(task: DesignTask, rule: str, options: argparse.Namespace) -> int:
-    gains = design(task, rule)
-    found = _Designs(task, rule, options.form, [gains])
+    found = _Designs(task, rule, options.form, options.table)
     if options.export is not None:
+        (gains,) = found.gains
         write(exported(gains, options.export, export_target(options)), options.output)
         for warning in gains.warnings:
             say(PROGRAM, warning)
     elif options.json:
-        print(to_json(found.document(every=False)), flush=True)
+        print(to_json(found.document()), flush=True)
     else:
-        print("\n".join(found.one()))
-    return DONE
-
-
-def _told(found: _Designs, options: argparse.Namespace) -> int:
-    if options.json:
-        print(to_json(found.document(every=True)), flush=True)
-    else:
-        print("\n".join(found.side_by_side()))
+        print("\n".join(found.lines()))
     if not found.gains:
         say(PROGRAM, "no rule gives gains for this model")
-        return NOTHING_FOUND
-    return DONE
+    if options.web:
+        every = found if options.table else replace(found, every=True)
+        show(PROGRAM, parser, options, [(every.case(), Shaping(task))])
+    return DONE if found.gains else NOTHING_FOUND
