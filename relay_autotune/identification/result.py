@@ -226,8 +226,8 @@ class Identification:
     # Standard deviation of the measurement beside drift, past and load, which the model has to
     # explain [y]; NaN: the whole measurement.
     to_explain: float = math.nan
-    # Models that each half of the record allows by itself.
-    halves: tuple[Part, ...] = ()
+    # Models that each part of the record allows by itself.
+    parts: tuple[Part, ...] = ()
     # Returns the FOPDT that was fitted beside the model; None: there is none, or it is the model.
     plain: Callable[[], Identification | None] | None = None
 

@@ -184,7 +184,7 @@ def test_levels_that_the_actuator_does_not_reach_show_beside_the_smaller_ones(se
     assert tune.outcome is Outcome.COMPLETED, tune.reason
     assert tune.settings.high > 1.2 * end
     found = analyse(tune.record(), alone=True)
-    assert any("two halves of the record" in told for told in found.model.warnings)
+    assert any("two parts of the record" in told for told in found.model.warnings)
     assert Loop(found.best_gains, process).ms() < 1.42
 
 

@@ -57,7 +57,7 @@ UNTOLD = {
             "began_away",
             "loaded",
             "to_explain",
-            "halves",
+            "parts",
             "plain",
         )
     ),

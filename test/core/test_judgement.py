@@ -56,7 +56,7 @@ def identified(record):
 
 
 @functools.lru_cache(maxsize=8)
-def in_halves(record):
+def in_parts(record):
     return identify(record, "waveform", Known(structure="fopdt"))
 
 
@@ -65,7 +65,7 @@ def other_model(found, model):
     own = found.estimate
     structure = GivenModel.of(model, found.parameters)
     estimate = Estimate(structure, own.values, own.covariance)
-    return replace(found, estimate=estimate, draws=(model,), halves=(), fitted=np.empty(0))
+    return replace(found, estimate=estimate, draws=(model,), parts=(), fitted=np.empty(0))
 
 
 def finding(name, record, found, gains):
@@ -96,7 +96,7 @@ def gains(analysed):
 
 def shown_beside(model, record, w):
     """Return mean and scatter of what a record shows beside a model."""
-    found = other_model(in_halves(record), model)
+    found = other_model(in_parts(record), model)
     draws = difference(found, record).draws(200, np.random.default_rng(0))(1j * w)
     return draws.mean(axis=1), draws.std(axis=1)
 
@@ -211,14 +211,14 @@ def joined(first, second, *, noise=0.02):
 
 def fitted_as(model, record):
     """Return what was identified with a FOPDT's parameters in the place of those found."""
-    found = in_halves(record)
+    found = in_parts(record)
     values = np.array((model.gain, model.time_constants[0].real, model.dead_time))
     return replace(found, estimate=replace(found.estimate, values=values))
 
 
 def test_each_half_of_a_record_tells_its_own_process():
     other = TransferFunction.fopdt(2.0, 10.0, 5.0)
-    early, late = in_halves(joined(PROCESS, other)).halves
+    early, late = in_parts(joined(PROCESS, other)).parts
     for part, process in ((early, PROCESS), (late, other)):
         # About the frequency of the loop, where the command has power.
         away = [abs(m(0.3j) / process(0.3j) - 1.0) for m in part.models]
@@ -226,22 +226,22 @@ def test_each_half_of_a_record_tells_its_own_process():
 
 
 def test_a_process_that_changed_is_drawn_as_each_half_shows_it():
-    found = in_halves(joined(PROCESS, TransferFunction.fopdt(2.0, 10.0, 5.0)))
+    found = in_parts(joined(PROCESS, TransferFunction.fopdt(2.0, 10.0, 5.0)))
     late = [m.dead_time for m in found.draws]
     assert min(late) < 3.5
     assert max(late) > 4.5
-    assert any("two halves of the record" in text for text in found.warnings)
-    same = in_halves(joined(PROCESS, PROCESS))
-    assert not any("two halves of the record" in text for text in same.warnings)
+    assert any("two parts of the record" in text for text in found.warnings)
+    same = in_parts(joined(PROCESS, PROCESS))
+    assert not any("two parts of the record" in text for text in same.warnings)
 
 
 @pytest.mark.parametrize("dead_time", [3.063, 3.064, 3.065])
-def test_halves_that_differ_as_much_as_their_noise_are_not_told(dead_time):
-    found = in_halves(joined(PROCESS, TransferFunction.fopdt(2.0, 10.0, dead_time)))
+def test_parts_that_differ_as_much_as_their_noise_are_not_told(dead_time):
+    found = in_parts(joined(PROCESS, TransferFunction.fopdt(2.0, 10.0, dead_time)))
     assert not any("differ 1 times" in text for text in found.warnings)
 
 
-def test_gains_hold_on_both_halves_of_a_process_that_changed():
+def test_gains_hold_on_both_parts_of_a_process_that_changed():
     other = TransferFunction.fopdt(2.0, 10.0, 5.0)
     gains = analyse(joined(PROCESS, other), known=Known(structure="fopdt"), alone=True).best_gains
     assert max(analysis.Loop(gains, PROCESS).ms(), analysis.Loop(gains, other).ms()) < 1.5
@@ -253,10 +253,10 @@ def test_gains_hold_on_both_halves_of_a_process_that_changed():
 @pytest.mark.parametrize(
     ("turned", "result"), [(10, Result.PASSED), (30, Result.DOUBTFUL), (40, Result.FAILED)]
 )
-def test_a_half_that_works_in_the_other_direction_gives_no_gains(record, gains, turned, result):
+def test_a_part_that_works_in_the_other_direction_gives_no_gains(record, gains, turned, result):
     other = TransferFunction.fopdt(-2.0, 10.0, 3.0)
-    half = Part(0.0, 100.0, (other,) * turned + (PROCESS,) * (40 - turned))
-    found = replace(identified(record), halves=(half,))
+    part = Part(0.0, 100.0, (other,) * turned + (PROCESS,) * (40 - turned))
+    found = replace(identified(record), parts=(part,))
     assert finding("direction", record, found, gains).result is result
 
 
@@ -282,7 +282,7 @@ def test_no_draw_goes_beyond_what_the_samples_allow():
 
 
 def test_the_draws_have_the_spread_of_the_covariance(record):
-    found = in_halves(record)
+    found = in_parts(record)
     for name, of in (("dead_time", "dead_time"), ("gain", "gain")):
         at = found.parameters.index(name)
         drawn = np.std([getattr(m, of) for m in found.draws])

@@ -218,7 +218,7 @@ def test_a_limit_cycle_that_no_structure_explains_gives_a_warning_or_a_reason(se
     assert any("not white" in w or "larger than the noise" in w for w in found.warnings)
 
 
-def test_a_half_with_one_model_says_nothing_of_the_scatter_between_halves():
+def test_a_part_with_one_model_says_nothing_of_the_scatter_between_parts():
     one = Part(0.0, 1.0, (TransferFunction.fopdt(2.0, 1.0, 0.5),))
     three = Part(1.0, 2.0, tuple(TransferFunction.fopdt(g, 1.0, 0.5) for g in (1.0, 1.1, 1.2)))
     with warnings.catch_warnings():

@@ -128,7 +128,7 @@ def _direction(evidence: Evidence) -> Measured | None:
         (said, found.draws),
         *(
             (f"{p.span} also fits a process of the other direction", p.models)
-            for p in found.halves
+            for p in found.parts
             if p.contradicts
         ),
     ]
@@ -154,7 +154,7 @@ MODEL_CHECKS = (
     Check(
         name="direction",
         title="Direction",
-        what="largest share of the models that the record, or one half of it, allows in which a "
+        what="largest share of the models that the record, or a part of it, allows in which a "
         "higher command moves the measurement the other way",
         unit="",
         doubtful=0.5,

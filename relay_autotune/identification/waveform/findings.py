@@ -112,7 +112,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         ultimate_gain_std=gain_std,
         ultimate_frequency_std=frequency_std,
         draws=allowed.models,
-        halves=allowed.halves,
+        parts=allowed.parts,
         effects=problem.effects(state.coefficients),
         began_away=_began_away(records, fit),
         loaded=problem.load is not None,
@@ -123,7 +123,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     apart = f"{math.sqrt(allowed.temper):.2g}"
     if float(apart) > 1.0:
         told = (
-            f"two halves of the record give models that differ {apart} times "
+            f"two parts of the record give models that differ {apart} times "
             "as much as their noise explains: the process, its load or its operating point "
             "changed; intervals are widened to hold both, and gains have to hold on both"
         )

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Models that a record allows: draws from one posterior over all candidates, and of each half.
+"""Models that a record allows: draws from one posterior over all candidates, and of each part.
 
 A candidate's posterior is that of its samples under the noise that was found, with a wide prior
 about its estimate: gain and each time are known to a factor of e, dead time and zero to all times
@@ -40,9 +40,9 @@ from relay_autotune.process.structures import Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant
 
-# Samples at which draws are compared with the fit, and those of both halves together.
-_MOST_SAMPLES, _MOST_OF_HALVES = 600, 2400
-# Least number of samples in a half that is asked for models of its own.
+# Samples at which draws are compared with the fit, and those of both parts together.
+_MOST_SAMPLES, _MOST_OF_PARTS = 600, 2400
+# Least number of samples in a part that is asked for models of its own.
 _FEWEST = 24
 # Share of its farthest level from which a command has its full reach, and least share of the
 # information that a part of the record has to hold.
@@ -52,9 +52,9 @@ _FULL, _LEAST_TOLD = 0.99, 0.05
 _STEPS, _HALVINGS, _SETTLED = 10, 4, 1e-3
 # Standard deviation of the prior of a logarithm; that of a dead time or a zero is all times.
 _LOGARITHM = 1.0
-# Draws of the mixture, whose share of bad ones is known to 5 %, and of each half.
+# Draws of the mixture, whose share of bad ones is known to 5 %, and of each part.
 DRAWS = 100
-_DRAWS_OF_HALF = 40
+_DRAWS_OF_PART = 40
 # Most that the density may fall at a standard deviation, in which it falls by 1 if it is normal.
 _FALLS = 2.0
 # Farthest point of the search in standard deviations of the prior.
@@ -63,12 +63,12 @@ _FARTHEST = 20.0
 _TRIES = 4
 # Share of the posterior that lies farther than a model that the samples exclude.
 _EXCLUDED = 1e-3
-# Draws of each half that differs, and copies of each plain model: more than the share that no
+# Draws of each part that differs, and copies of each plain model: more than the share that no
 # promise of the design holds on.
 _SHARE = DRAWS // 10
 # Largest excess of another model's residual over the chosen one's, as a share of the spread.
 _AS_WELL = 0.05
-# Mean square of two standardised deviations that 99 % of equal halves do not exceed.
+# Mean square of two standardised deviations that 99 % of equal parts do not exceed.
 _BY_CHANCE = 4.6
 
 
@@ -77,13 +77,13 @@ class Posterior:
     """The models that a record allows.
 
     :param models: drawn from the mixture over all candidates, each as likely as the others, and
-        what gains have to hold on besides: either side of an unequal process, both halves of one
+        what gains have to hold on besides: either side of an unequal process, both parts of one
         that changed, a plain model beside one in colour.
     :param mixture: those of the candidates alone.
     :param values: of the chosen structure's parameters in its own draws, shape (k, p).
     :param own: the models of these.
-    :param halves: those of each half alone; empty where a half holds too little.
-    :param temper: mean square of the difference of the halves over that by chance, at least 1:
+    :param parts: those of each part alone; empty where a part holds too little.
+    :param temper: mean square of the difference of the parts over that by chance, at least 1:
         the ratio by which the record's variances are larger than its noise alone explains.
     """
 
@@ -91,21 +91,21 @@ class Posterior:
     mixture: tuple[TransferFunction, ...]
     values: FloatArray
     own: tuple[TransferFunction, ...]
-    halves: tuple[Part, ...] = ()
+    parts: tuple[Part, ...] = ()
     temper: float = 1.0
 
 
 def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: float) -> Posterior:
-    """Return the models that a record allows, and those that each half allows.
+    """Return the models that a record allows, and those that each part allows.
 
     :param fit: with its candidates, the chosen one first.
     :param shares: support of each candidate; their sum is 1.
     :param inflation: ratio of the variances to those of the noise that was found.
-    :param frequency: about that of the loop, at which the halves are compared [rad/s].
+    :param frequency: about that of the loop, at which the parts are compared [rad/s].
     """
     rng = np.random.default_rng(0)
-    halves = _halves(fit, inflation, rng)
-    temper = max(_apart(halves, frequency) / _BY_CHANCE, 1.0)
+    parts = _parts(fit, inflation, rng)
+    temper = max(_apart(parts, frequency) / _BY_CHANCE, 1.0)
     most = _most_left(fit)
     mixture: list[TransferFunction] = []
     models: list[TransferFunction] = []
@@ -122,10 +122,10 @@ def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: fl
     mixture = [*rest, *mixture]
     models = [*_on_both_sides(rest, fit.problem, fit.state), *models]
     if temper > 1.0:
-        # The process changed from one half to the other: both are among the models.
-        models += [m for part in halves for m in part.models[:_SHARE]]
+        # The process changed from one part to the other: both are among the models.
+        models += [m for part in parts for m in part.models[:_SHARE]]
     models += [m for m in _plain(fit) for _ in range(_SHARE)]
-    return Posterior(tuple(models), tuple(mixture), own.values, own.models, halves, temper)
+    return Posterior(tuple(models), tuple(mixture), own.values, own.models, parts, temper)
 
 
 def _on_both_sides(
@@ -180,8 +180,8 @@ def _draws(
     return _allowed(exact, gain, state.theta, scale, lambda _: variance, count, rng)
 
 
-def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part, ...]:
-    """Return the models that each half of a record allows in the chosen structure.
+def _parts(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part, ...]:
+    """Return the models that each part of a record allows in the chosen structure.
 
     They meet where the command first has its full reach: an actuator at its end, or a process that
     is not linear, answers large moves otherwise than small ones. Where one of them would tell
@@ -193,7 +193,7 @@ def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part,
     if len(problem.bounds) > 1 or problem.structure.unstable:
         return ()
     if problem.colour is None:
-        problem = problem.thinned(_MOST_OF_HALVES)
+        problem = problem.thinned(_MOST_OF_PARTS)
     gain = state.coefficients[: len(problem.structure.powers)]
     jacobian = _slopes(problem, gain, state.theta)
     size = np.einsum("pn,pn->p", jacobian, jacobian)
@@ -214,7 +214,7 @@ def _halves(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part,
         def variance_of(left: FloatArray, degrees: int = degrees) -> float:
             return inflation * float(left @ left) / degrees
 
-        found = _allowed(part, gain, state.theta, fit.scale, variance_of, _DRAWS_OF_HALF, rng)
+        found = _allowed(part, gain, state.theta, fit.scale, variance_of, _DRAWS_OF_PART, rng)
         if found.models and found.explains:
             ends = float(part.time[0]), float(part.time[-1])
             parts.append(Part(*ends, found.models, found.excludes_known))
@@ -230,17 +230,17 @@ def _full_reach(problem: Problem) -> int:
     return int(np.argmax(reach >= _FULL * reach.max()))
 
 
-def _apart(halves: Sequence[Part], frequency: float) -> float:
-    """Return the mean square of the difference of two halves' responses over its covariance.
+def _apart(parts: Sequence[Part], frequency: float) -> float:
+    """Return the mean square of the difference of two parts' responses over its covariance.
 
     With d the difference of the mean logarithms of their responses at one frequency, as real and
     imaginary part, and C the sum of their covariances, it is ``d' C^-1 d/2``: 1 on average for one
     process.
     """
-    if len(halves) < 2 or any(len(part.models) < 2 for part in halves):
+    if len(parts) < 2 or any(len(part.models) < 2 for part in parts):
         return 0.0
     found = []
-    for part in halves:
+    for part in parts:
         at = np.array([complex(m(1j * frequency)) for m in part.models])
         logs = np.log(at / at[0]) + np.log(at[0])
         found.append(np.stack((logs.real, logs.imag)))
@@ -248,7 +248,7 @@ def _apart(halves: Sequence[Part], frequency: float) -> float:
     difference[1] = (difference[1] + math.pi) % (2.0 * math.pi) - math.pi
     first, second = (np.cov(logs) for logs in found)
     if not max(first[0, 0], second[0, 0]) < _LOGARITHM**2:
-        # A half that knows the gain no better than the prior does tells nothing.
+        # A part that knows the gain no better than the prior does tells nothing.
         return 0.0
     covariance = first + second
     return 0.5 * float(difference @ np.linalg.pinv(covariance, hermitian=True) @ difference)
