@@ -123,21 +123,16 @@ def _run(options: argparse.Namespace) -> int:
     tell_replaced(PROGRAM, options.output)
     write_report(cases, options.output, title=options.title)
     print(options.output)
-    if options.figures:
+    if folder := options.figures:
         try:
-            _announce_figures(options.figures, options.format)
-            for path in write_figures(cases, options.figures, options.format):
+            if any(Path(folder).glob(f"*.{options.format}")):
+                say(PROGRAM, f"{folder} has figures already; those of the same name are replaced")
+            for path in write_figures(cases, folder, options.format):
                 print(path)
         except OSError as error:
-            folder, why = options.figures, system_says(error)
+            why = system_says(error)
             raise BagError(f"the figures cannot be written to {folder}: {why}") from error
     return status
-
-
-def _announce_figures(folder: str, kind: str) -> None:
-    there = sorted(path.name for path in Path(folder).glob(f"*.{kind}"))
-    if there:
-        say(PROGRAM, f"{folder} has figures already; those of the same name are replaced")
 
 
 def command_line(program: str, arguments: Sequence[str] | None) -> str:

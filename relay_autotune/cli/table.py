@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -183,10 +183,12 @@ def gains_lines(
 
 def _series(gains: Gains) -> tuple[str, ...]:
     found = series_form(gains)
-    return (
-        f"kc {digits(found.kc)} u/y   ti {digits(found.ti)} s   td {digits(found.td)} s   "
-        f"alpha {digits(found.alpha, 3)}   b {gains.b:g}",
-    )
+    return (f"{_three(found)}   alpha {digits(found.alpha, 3)}   b {gains.b:g}",)
+
+
+def _three(of: Any) -> str:
+    """Return the numbers that gains of the ISA and of the series form have."""
+    return f"kc {digits(of.kc)} u/y   ti {digits(of.ti)} s   td {digits(of.td)} s"
 
 
 def beside(
@@ -394,12 +396,7 @@ def _validation(validation: Validation) -> str:
 def _other_gains(analysis: Analysis) -> list[_Entry]:
     """Return what the other rules say, a line for each."""
     others = [gains for i, gains in enumerate(analysis.gains) if i != analysis.recommended]
-    texts = [
-        f"kc {digits(g.kc)} u/y   ti {digits(g.ti)} s   td {digits(g.td)} s   "
-        f"Ms {digits(g.ms, 3)}   ({g.rule})"
-        for g in others
-    ]
-    return _listed("also", texts)
+    return _listed("also", [f"{_three(g)}   Ms {digits(g.ms, 3)}   ({g.rule})" for g in others])
 
 
 def _gains(gains: Gains, verdict: Verdict, series: Sequence[str]) -> list[_Entry]:
@@ -408,9 +405,7 @@ def _gains(gains: Gains, verdict: Verdict, series: Sequence[str]) -> list[_Entry
         ("gains", gains.rule + mark),
         (
             "  ISA form",
-            f"kc {digits(gains.kc)} u/y   ti {digits(gains.ti)} s   td {digits(gains.td)} s"
-            + (f"   tf {digits(gains.tf)} s" if gains.tf else "")
-            + f"   b {gains.b:g}",
+            _three(gains) + f"   tf {digits(gains.tf)} s" * bool(gains.tf) + f"   b {gains.b:g}",
         ),
         *(("  series form", text) for text in series),
         (

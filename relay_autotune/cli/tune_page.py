@@ -38,7 +38,6 @@ from relay_autotune.exchange.messages import (
     record_from_cycles,
 )
 from relay_autotune.experiment.early_end import ULTIMATE_GAIN
-from relay_autotune.identification.result import Identification
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.report.case import Case, EstimatedQuantity, case_of, ultimate_of
 from relay_autotune.result import Analysis
@@ -102,7 +101,9 @@ class _LoopOnPage:
         # The context in which commands are shown as they come.
         self._commands_shown: Callable[[], AbstractContextManager[None]] = nullcontext
         self._interrupted = interrupted
-        self._gains = GainsPage(loop, self._live, page, number, self._is_to_end)
+        self._gains = GainsPage(
+            loop, self._live, page, number, lambda: self._live.abort.is_set() or bool(interrupted)
+        )
         # About the running tune: messages of the cycles, K_u after each, signals or a wish to end
         # it, and what is done at its first feedback.
         self._cycles: list[Any] = []
@@ -139,9 +140,6 @@ class _LoopOnPage:
         finally:
             self._gains.close()
         return status
-
-    def _is_to_end(self) -> bool:
-        return self._live.abort.is_set() or bool(self._interrupted)
 
     def _show_signals(self) -> None:
         live = self._live
@@ -301,28 +299,22 @@ class _LoopOnPage:
         :param cycle: number of whole cycles.
         """
         found = identification_from_message(message)
-        # By another thread: this one has to hear relay_node, and who ends the tune.
-        self._page.worker.ask(
-            partial(self._show_model, found, cycle, list(self._cycles), self._ultimate)
-        )
-        return process_text(found.model)
+        cycles, ultimate = list(self._cycles), self._ultimate
 
-    def _show_model(
-        self,
-        found: Identification,
-        cycle: int,
-        cycles: list[Any],
-        ultimate: dict[int, EstimatedQuantity],
-    ) -> None:
-        """Show a model over the data so far, and how its intervals narrow."""
-        for each in ultimate_of(found):
-            if each.name == ULTIMATE_GAIN:
-                ultimate[cycle] = each
-        record = None
-        # Without the first cycle it is not known where the process was at rest.
-        if {0, *(c.index for c in cycles)} == set(range(len(cycles))):
-            record = record_from_cycles(cycles)
-        self._live.show("model", of_running(found, record, list(ultimate.items())))
+        def show() -> None:
+            """Show the model over the data so far, and how its intervals narrow."""
+            for each in ultimate_of(found):
+                if each.name == ULTIMATE_GAIN:
+                    ultimate[cycle] = each
+            record = None
+            # Without the first cycle it is not known where the process was at rest.
+            if {0, *(c.index for c in cycles)} == set(range(len(cycles))):
+                record = record_from_cycles(cycles)
+            self._live.show("model", of_running(found, record, list(ultimate.items())))
+
+        # By another thread: this one has to hear relay_node, and who ends the tune.
+        self._page.worker.ask(show)
+        return process_text(found.model)
 
     def tick(self) -> None:
         """Heed what was wished or signalled."""
@@ -361,14 +353,13 @@ class _LoopOnPage:
         def shown(found: Analysis) -> Case:
             return replace(case_of(found, bag or self._loop.title), command=command(first))
 
-        target = self._loop.target
         subject = PageModel(
             shown(found),
             found.shaping,
             first,
             command,
             self._number,
-            target,
+            self._loop.target,
             self._live.told.began,
         )
         self._live.tell(tuned=self._page.add(subject))
