@@ -59,6 +59,7 @@ Examples:
 _number = partial(Quantity, default=math.nan)
 _positive = partial(_number, lower=0.0, open_ended=True)
 _not_negative = partial(_number, lower=0.0)
+_not_zero = partial(_number, zero=False)
 NUMBERS = (
     _positive("period", unit="s", description="Period of the limit cycle."),
     _positive("period_high", unit="s", description="Time that the command stays high."),
@@ -73,7 +74,7 @@ NUMBERS = (
     _not_negative(
         "hysteresis", unit="y", description="Half width of the switching band, 0 if not given."
     ),
-    _number("gain", unit="y/u", description="Static gain of the process."),
+    _not_zero("gain", unit="y/u", description="Static gain of the process."),
     _not_negative("dead_time", unit="s", description="Dead time of the process."),
     _positive(
         "extra_delay", unit="s", description="Dead time added to the relay, in the second test."
@@ -96,15 +97,14 @@ NUMBERS = (
         description="From the steady state to the peak, if not the time from the switch.",
     ),
     _positive("time_half", unit="s", description="From the steady state to half of the peak."),
-    _number("step", unit="u", description="Height of a step of the command."),
+    _not_zero("step", unit="u", description="Height of a step of the command."),
     _positive("t1", unit="s", description="From the end of the dead time to the extremum."),
     _positive("t2", unit="s", description="From the end of the dead time to the return."),
-    _number(
+    _not_zero(
         "extremum", unit="y", description="Minimum or maximum after a step, from the steady state."
     ),
 )
 """What the command line may give."""
-_NOT_ZERO = ("gain", "step", "extremum")
 
 
 # Each method is a function of the numbers that it takes, by their names in NUMBERS; those without
@@ -291,8 +291,8 @@ def identify_chart(method: str, numbers: Mapping[str, float], known: Known) -> I
     :param method: one of ``CHART_METHODS``.
     :param numbers: those that were given, by name.
     :param known: structure and order, where they are known.
-    :raises SelectionError: if the method is unknown, or a number is missing, out of its range, or
-        not used by the method.
+    :raises SelectionError: if the method is unknown, or a number is missing, or not used by the
+        method.
     :raises IdentificationError: if no model has these numbers.
     """
     chart = look_up(CHART_METHODS, method, "method", SelectionError)
@@ -303,8 +303,6 @@ def identify_chart(method: str, numbers: Mapping[str, float], known: Known) -> I
         raise SelectionError(f"{method} does not use {', '.join(unused)}; it takes {takes}")
     if (known.structure or known.order) and not chart.takes_structure:
         raise SelectionError(f"{method} does not use --structure and --order")
-    if zero := [_FLAGS[name] for name in _NOT_ZERO if numbers.get(name) == 0.0]:
-        raise SelectionError(f"{', '.join(zero)} must not be 0")
     return chart.identify(*([known] if chart.takes_structure else []), **numbers)
 
 

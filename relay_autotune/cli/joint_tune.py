@@ -81,9 +81,10 @@ class JointLoop(Loop):
             self.options = options
             if options.open:
                 loaded = self._manager.controllers()
-                self._forward = forwarding(
-                    loaded, loop.interface, options.forward or "", self._limp
-                )
+                # What has to be held while the controller is off.
+                limp = loop.follows and loop.commanded == "effort"
+                beside = [f"{dof}/effort" for dof in loop.dofs] if limp else []
+                self._forward = forwarding(loaded, loop.interface, options.forward or "", beside)
                 self._former = in_the_way(loaded, self._forward.needs)
                 self._held = self._commands_beside(self._forward)
         if loop.why_not_moved and not options.open:
@@ -145,14 +146,6 @@ class JointLoop(Loop):
             f"type: {typed}; publish the references on {loop.reference_topic}, and after the tune "
             f"type: {back}; or give --open"
         )
-
-    @property
-    def _limp(self) -> tuple[str, ...]:
-        """Command interfaces that have to be held while the controller is off."""
-        loop = self._loop
-        if loop.follows and loop.commanded == "effort":
-            return tuple(f"{dof}/{loop.commanded}" for dof in loop.dofs)
-        return ()
 
     # What is to happen.
 

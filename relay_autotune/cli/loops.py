@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.bag.field_path import first_numbers, unit_of_field
+from relay_autotune.bag.topics import only_field
 from relay_autotune.cli.own_nodes import OwnNodes
 from relay_autotune.cli.settings import FLAGS, SETTING, Answers, as_flags
 from relay_autotune.cli.terminal import UNITS, Working, asked, broken, width
@@ -32,6 +33,13 @@ from relay_autotune.exchange.messages import (
     reason_from_message,
     transfer_function_from_message,
 )
+from relay_autotune.nodes.live_types import (
+    CommandMessage,
+    Reader,
+    message_class,
+    reader_of,
+    struct_of,
+)
 from relay_autotune.nodes.shell import ros_arguments, typed_for_parameter
 from relay_autotune.nodes.tables import sensor_parameters
 from relay_autotune.reasons import Code, Reason
@@ -39,7 +47,6 @@ from relay_autotune.text import in_units
 
 if TYPE_CHECKING:
     from relay_autotune.loop.gains import Controller
-    from relay_autotune.nodes.live_types import Reader
     from relay_autotune.nodes.tune_client import TuneClient
 
 # Purpose and text of each command that may follow.
@@ -322,28 +329,24 @@ class TopicLoop(Loop):
     has_own_nodes = proves = True
 
     def __init__(self, client: TuneClient, options: argparse.Namespace) -> None:
-        # Imported here, because it needs ROS.
-        from relay_autotune.nodes.live_types import CommandMessage
-
         super().__init__(client, options)
         answers, measurement, command = self.answers, options.measurement, options.command
         with Working(f"looking at {measurement} and {command}"):
             self._kind = client.kind_of(measurement, options.wait, published=True)
             self._command_kind = client.kind_of(command, options.wait, published=False)
         reader = self._reader()
-        self._command_field = options.command_field or "data"
         with Working(f"listening to {measurement}"):
             heard = client.heard(reader.kind, measurement, bool, options.wait, number=reader.value)
         answers.measured = heard[-1] if heard else math.nan
         try:
             self._commands = CommandMessage(
-                self._command_kind, self._command_field, options.command_message or ""
+                self._command_kind, options.command_field, options.command_message or ""
             )
         except ParameterError as error:
             raise SelectionError(as_flags(str(error))) from None
         for letter, kind, field in (
             ("y", self._kind, options.field),
-            ("u", self._command_kind, self._command_field),
+            ("u", self._command_kind, options.command_field),
         ):
             if unit := unit_of_field(kind, field):
                 UNITS[letter] = unit
@@ -360,10 +363,6 @@ class TopicLoop(Loop):
 
         :raises SelectionError: if nobody can be asked.
         """
-        # Imported here, because it needs ROS.
-        from relay_autotune.bag.topics import only_field
-        from relay_autotune.nodes.live_types import message_class, reader_of, struct_of
-
         options = self.options
         while True:
             try:
@@ -434,7 +433,6 @@ class TopicLoop(Loop):
             # By the rate, which relay_node measures before the tune.
             "measurement_timeout": 0.0,
             **self.answers.parameters(),
-            "command_field": self._command_field,
             # Without an identifier_node it would wait for nothing.
             **({"model_timeout": 0.0} if options.record_only else {}),
         }

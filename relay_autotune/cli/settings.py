@@ -147,7 +147,7 @@ SETTINGS = (
         "field", "data", metavar="PATH", question="the number that measures",
         parameters=("measurement_field",), loops=_COMMANDING,
     ).means("the number in the messages of --measurement (%(default)s)"),
-    Setting("command_field", "", metavar="PATH", parameters=("command_field",)).means(
+    Setting("command_field", "data", metavar="PATH", parameters=("command_field",)).means(
         "the number in the messages of --command, such as linear.x"
     ),
     Setting(
