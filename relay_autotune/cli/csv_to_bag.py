@@ -124,6 +124,5 @@ def _convert(options: argparse.Namespace) -> int:
 def topic_name(column: str) -> str:
     """Return the topic for a column: its name in lower case, without a unit in brackets."""
     bare = re.sub(r"[(\[].*?[)\]]", "", column).lower()
-    words = re.findall(r"[a-z0-9]+", bare)
-    name = "_".join(words)
+    name = "_".join(re.findall(r"[a-z0-9]+", bare))
     return f"/{name}" if name[:1].isalpha() else f"/_{name}"

@@ -118,7 +118,8 @@ class Loop:
 
     def lacking(self) -> list[str]:
         """Return the questions that must be answered before a tune."""
-        return self.answers.lacking(self.form) if self.has_own_nodes else []
+        lacking = filter(self.answers.lacks, self.form if self.has_own_nodes else ())
+        return [SETTING[name].question for name in lacking]
 
     def look(self) -> None:
         """Take the settings that relay_node has now; nobody else changes one of this command."""

@@ -154,20 +154,14 @@ def free_domain() -> Iterator[int]:
     candidates = list(range(1, 102))
     random.SystemRandom().shuffle(candidates)
     for domain in candidates:
-        lock = os.open(folder / f"{domain}.lock", os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(lock)
-            continue
-        if _is_used(domain):
-            os.close(lock)
-            continue
-        try:
-            yield domain
-        finally:
-            os.close(lock)
-        return
+        with (folder / f"{domain}.lock").open("a") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            if not _is_used(domain):
+                yield domain
+                return
     raise RelayAutotuneError("no free ROS domain between 1 and 101: end what uses them")
 
 

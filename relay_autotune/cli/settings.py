@@ -353,7 +353,7 @@ class Answers:
         for each in questions:
             if (given := self[each.name]) is not None:
                 self.take({each.name: given}, self.source(each.name))
-        self._asked = [each for each in questions if self._lacks(each.name)]
+        self._asked = [each for each in questions if self.lacks(each.name)]
         told = ["u is the command's unit, y the measurement's"] * (len(UNITS) < 2)
         told += [f"{BACK} at a question goes back to the one before"] * (len(self._asked) > 1)
         if sys.stdin.isatty() and self._asked and told:
@@ -419,14 +419,11 @@ class Answers:
                 "needed": needed,
             }
 
-    def lacking(self, names: Sequence[str]) -> list[str]:
-        """Return the questions of the settings that have no value yet and need one.
+    def lacks(self, name: str) -> bool:
+        """Return whether a setting has no value yet and needs one.
 
-        :param names: of the settings.
+        :param name: of the setting.
         """
-        return [SETTING[name].question for name in names if self._lacks(name)]
-
-    def _lacks(self, name: str) -> bool:
         # An amplitude that is given is not searched for between the limits of the command.
         return self[name] is None and not (name == "command_within" and self["amplitude"])
 

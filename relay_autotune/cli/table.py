@@ -26,7 +26,7 @@ from relay_autotune.loop.gains import series_form
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import limit_cycle
-from relay_autotune.record.record import Outcome, Record
+from relay_autotune.record.record import Outcome
 from relay_autotune.text import (
     counted,
     date_text,
@@ -226,12 +226,15 @@ def _laid_out(entries: Sequence[_Entry], width: int) -> list[str]:
 
 def _experiment(analysis: Analysis, which: str, form: str) -> list[_Entry]:
     record = analysis.record
-    lines = [(f"experiment{which}", _outcome(record))]
+    name = f"  ({record.experiment_id})" if record.experiment_id else ""
+    lines = [(f"experiment{which}", record.outcome.words + name)]
     # The reason for no gains begins with it.
     told = record.reason in analysis.reason
     if record.reason and not told and record.outcome != Outcome.COMPLETED:
         lines.append(("", record.reason))
-    lines.append(("recorded", _span(record)))
+    begun = f", from {date_text(record.start)}" if record.start else ""
+    span = span_text(record.duration, len(record), record.lost_samples)
+    lines.append(("recorded", span + begun))
     lines += _limit_cycle(analysis)
     if analysis.model is not None:
         lines += [_BLANK, *_identification(analysis.model)]
@@ -265,18 +268,6 @@ def _verdict(judgement: Judgement) -> list[_Entry]:
         ("verdict", ", ".join(told)),
         *((f"  {found.title.lower()}", found.said) for found in worse),
     ]
-
-
-def _outcome(record: Record) -> str:
-    name = f"  ({record.experiment_id})" if record.experiment_id else ""
-    return record.outcome.words + name
-
-
-def _span(record: Record) -> str:
-    text = span_text(record.duration, len(record), record.lost_samples)
-    if record.start:
-        text += f", from {date_text(record.start)}"
-    return text
 
 
 def _limit_cycle(analysis: Analysis) -> list[_Entry]:
@@ -323,9 +314,7 @@ def _identification(found: Identification) -> list[_Entry]:
     lines += _listed("rivals", rivals)
     if found.why_chosen:
         lines.append(("", found.why_chosen))
-    for warning in found.warnings:
-        lines.append(("warning", warning))
-    return lines
+    return lines + [("warning", warning) for warning in found.warnings]
 
 
 def _known_all_the_same(found: Identification) -> list[_Entry]:
@@ -337,9 +326,7 @@ def _known_all_the_same(found: Identification) -> list[_Entry]:
         interval = f"95 %: {digits(c.ci95_low)} to {digits(c.ci95_high)}"
         known = f"{c.name.replace('_', ' ')} {digits(c.value)} {c.unit} ({interval})"
         lines.append(("determined", known))
-    for sentence in found.advice:
-        lines.append(("would help", sentence))
-    return lines
+    return lines + [("would help", sentence) for sentence in found.advice]
 
 
 def _others(analysis: Analysis) -> list[_Entry]:
@@ -434,9 +421,7 @@ def _gains(gains: Gains, verdict: Verdict, series: Sequence[str]) -> list[_Entry
         )
     if gains.reason:
         lines.append(("  because", gains.reason))
-    for warning in gains.warnings:
-        lines.append(("  warning", warning))
-    return lines
+    return lines + [("  warning", warning) for warning in gains.warnings]
 
 
 def _step(does: Performance) -> str:

@@ -153,12 +153,9 @@ def in_columns(rows: Sequence[Sequence[str]], columns: int) -> list[str]:
     needed = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
     gap = 2 if sum(needed) + 2 * len(needed) <= columns else 1
     first, *others = needed
+    widths = [gap + n for n in others]
     return [
-        f"{_INDENT}{row[0]:<{first}}".rstrip()
-        if not any(row[1:])
-        else _INDENT
-        + f"{row[0]:<{first}}"
-        + "".join(f"{cell:>{gap + n}}" for cell, n in zip(row[1:], others, strict=True)).rstrip()
+        "".join((_INDENT, row[0].ljust(first), *map(str.rjust, row[1:], widths))).rstrip()
         for row in rows
     ]
 
@@ -487,11 +484,7 @@ def asked(
     :raises GoBack: if that is to be asked again.
     """
     _require_somebody(flag)
-    shown = (
-        f"{in_units(what, UNITS)}, such as {example}"
-        + f" [{known}]: " * bool(known)
-        + ": " * (not known)
-    )
+    shown = f"{in_units(what, UNITS)}, such as {example}" + f" [{known}]" * bool(known) + ": "
     while True:
         text = _input(shown) or known
         if back and text == BACK:

@@ -657,7 +657,7 @@ def test_a_plan_says_what_is_missing_or_which_answer_cannot_be_and_leaves_the_st
     assert (live.told.phase, live.told.status, live.told.tone) == ("idle", "proof passed", "good")
     # A given amplitude is not searched for between the limits of the command.
     loop.options.amplitude, loop.options.at = 1.0, 2.0
-    assert loop.answers.lacking(loop.form) == []
+    assert loop.lacking() == []
 
 
 def test_a_plan_that_relay_node_refuses_marks_the_answer_to_change() -> None:
