@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
@@ -56,53 +57,39 @@ Examples:
            --peak-max 0.5 --peak-min -0.29 --relay 1 --bias 0.3 --gain 1
 """
 
-_number = partial(Quantity, default=math.nan)
+
+def _number(name: str, unit: str, description: str, **limits: Any) -> Quantity:
+    return Quantity(name, math.nan, unit, description=description, **limits)
+
+
 _positive = partial(_number, lower=0.0, open_ended=True)
 _not_negative = partial(_number, lower=0.0)
 _not_zero = partial(_number, zero=False)
 NUMBERS = (
-    _positive("period", unit="s", description="Period of the limit cycle."),
-    _positive("period_high", unit="s", description="Time that the command stays high."),
-    _positive("period_low", unit="s", description="Time that the command stays low."),
-    _positive("amplitude", unit="y", description="Half of peak to peak of the measurement."),
-    _number("peak_max", unit="y", description="Highest measurement, from its steady state."),
-    _number("peak_min", unit="y", description="Lowest measurement, from its steady state."),
-    _positive(
-        "relay", unit="u", description="Amplitude of the relay, half the distance of its levels."
-    ),
-    _number("bias", unit="u", description="Middle of the relay's levels, from the steady state."),
-    _not_negative(
-        "hysteresis", unit="y", description="Half width of the switching band, 0 if not given."
-    ),
-    _not_zero("gain", unit="y/u", description="Static gain of the process."),
-    _not_negative("dead_time", unit="s", description="Dead time of the process."),
-    _positive(
-        "extra_delay", unit="s", description="Dead time added to the relay, in the second test."
-    ),
-    _positive("period_2", unit="s", description="Period in the second test."),
-    _positive("amplitude_2", unit="y", description="Half of peak to peak in the second test."),
-    _positive(
-        "relay_2", unit="u", description="Amplitude of the relay in the second test, if another."
-    ),
-    _number(
-        "mean_measurement", unit="y", description="Mean over whole cycles, from the steady state."
-    ),
-    _number(
-        "mean_command", unit="u", description="Mean over whole cycles, from the steady state."
-    ),
-    _positive("time_to_peak", unit="s", description="From a switch to the peak after it."),
-    _positive(
-        "rise",
-        unit="s",
-        description="From the steady state to the peak, if not the time from the switch.",
-    ),
-    _positive("time_half", unit="s", description="From the steady state to half of the peak."),
-    _not_zero("step", unit="u", description="Height of a step of the command."),
-    _positive("t1", unit="s", description="From the end of the dead time to the extremum."),
-    _positive("t2", unit="s", description="From the end of the dead time to the return."),
-    _not_zero(
-        "extremum", unit="y", description="Minimum or maximum after a step, from the steady state."
-    ),
+    _positive("period", "s", "Period of the limit cycle."),
+    _positive("period_high", "s", "Time that the command stays high."),
+    _positive("period_low", "s", "Time that the command stays low."),
+    _positive("amplitude", "y", "Half of peak to peak of the measurement."),
+    _number("peak_max", "y", "Highest measurement, from its steady state."),
+    _number("peak_min", "y", "Lowest measurement, from its steady state."),
+    _positive("relay", "u", "Amplitude of the relay, half the distance of its levels."),
+    _number("bias", "u", "Middle of the relay's levels, from the steady state."),
+    _not_negative("hysteresis", "y", "Half width of the switching band, 0 if not given."),
+    _not_zero("gain", "y/u", "Static gain of the process."),
+    _not_negative("dead_time", "s", "Dead time of the process."),
+    _positive("extra_delay", "s", "Dead time added to the relay, in the second test."),
+    _positive("period_2", "s", "Period in the second test."),
+    _positive("amplitude_2", "y", "Half of peak to peak in the second test."),
+    _positive("relay_2", "u", "Amplitude of the relay in the second test, if another."),
+    _number("mean_measurement", "y", "Mean over whole cycles, from the steady state."),
+    _number("mean_command", "u", "Mean over whole cycles, from the steady state."),
+    _positive("time_to_peak", "s", "From a switch to the peak after it."),
+    _positive("rise", "s", "From the steady state to the peak, if not the time from the switch."),
+    _positive("time_half", "s", "From the steady state to half of the peak."),
+    _not_zero("step", "u", "Height of a step of the command."),
+    _positive("t1", "s", "From the end of the dead time to the extremum."),
+    _positive("t2", "s", "From the end of the dead time to the return."),
+    _not_zero("extremum", "y", "Minimum or maximum after a step, from the steady state."),
 )
 """What the command line may give."""
 
