@@ -398,7 +398,7 @@ class AfterTune(Tuned):
     def _made(self, proof: Proof, step: float) -> Any:
         """Make the step, and show what it has found."""
         with noted(lambda text: say(PROGRAM, text)) as (shown, leave):
-            found, self._proof = proof.made(step, bool(self.doubt), shown, leave)
+            found, self._proof, _ = proof.made(step, bool(self.doubt), shown, leave)
         print()
         for entry in self._proof[1:]:
             tell(*entry)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -217,9 +217,7 @@ class GainsPage:
         if isinstance(steps, Proof):
             what, left = "proof", f"; the command stands at {self.loop.options.at:.6g} u"
             self._begin_step(f"starting {CONTROLLER}")
-            result, entries = steps.made(
-                step, wish.doubtful, self._say, self.leave, self._show_steps
-            )
+            result, entries, shown = steps.made(step, wish.doubtful, self._say, self.leave)
             if result.steps:
                 subject = self.page.subjects[wish.of]
                 subject.case = replace(subject.case, proof=entries)
@@ -231,7 +229,10 @@ class GainsPage:
                 result, entries = verified(
                     controller, step, self._say, self.leave, message, stays=False
                 )
-                self._show_steps(controller.steps_of(result))
+                shown = controller.steps_of(result)
+        if shown:
+            # In place of the proof before; one that was cut short has no steps.
+            live.show("proof", [_document(each) for each in shown])
         live.rest(
             f"{what} {'passed' if result.passed else 'failed'}: {result.reason}{left}",
             good=result.passed,
@@ -241,11 +242,6 @@ class GainsPage:
 
     def _say(self, text: str) -> None:
         self.live.tell(status=text)
-
-    def _show_steps(self, steps: Sequence[Any]) -> None:
-        """Show a proof in place of the one before; one that was cut short has no steps."""
-        if steps:
-            self.live.show("proof", [_document(step) for step in steps])
 
     def _begin_step(self, status: str) -> None:
         """Show from now on the samples of a step in place of those of the tune."""

@@ -245,21 +245,16 @@ class Proof:
                 loop.nodes.end(CONTROLLER)
 
     def made(
-        self,
-        step: float,
-        doubtful: bool,
-        tell: Callable[[str], None],
-        leave: Callable[[], bool],
-        show: Callable[[list[Any]], object] = lambda _: None,
-    ) -> tuple[Any, Entries]:
+        self, step: float, doubtful: bool, tell: Callable[[str], None], leave: Callable[[], bool]
+    ) -> tuple[Any, Entries, list[Any]]:
         """Put the gains in force, make the step, and go back.
 
         :param step: of the set-point [y].
         :param doubtful: whether the gains are.
         :param tell: called with what is waited for.
         :param leave: returns True to end the step.
-        :param show: called with the samples of the step.
-        :return: the `Verify.Result`, and what it has found, of which gains and when.
+        :return: the `Verify.Result`; what it has found, of which gains and when; and its steps
+            with their samples.
         """
         patience = max(_TIMES_SETTLING * self._choice.settles, _REST_WITHIN)
         with self._started(doubtful) as controller:
@@ -269,9 +264,9 @@ class Proof:
             if found.passed:
                 # Without gains it would hold its command, wherever that is.
                 controller.let_settle(self._choice.settles, tell, "the loop goes back", leave)
-            show(controller.steps_of(found))
+            steps = controller.steps_of(found)
         which = f"{gains_words(self._gains)}, at {time.strftime('%H:%M')}"
-        return found, (("gains", which), *found_entries(found))
+        return found, (("gains", which), *found_entries(found)), steps
 
 
 def gains_words(gains: Controller | None) -> str:

@@ -136,10 +136,10 @@ def test_a_proof_is_in_the_report_of_its_gains_and_is_computed_once(monkeypatch)
             self.allowed.require(step)
             return (("moves", f"by {step:+g} y"),)
 
-        def made(self, step, doubtful, tell, leave, show):
+        def made(self, step, doubtful, tell, leave):
             asked.append(step)
             result = Verify.Result(passed=True, reason="numbers", steps=[made])
-            return result, (("gains", "kc 0.5"), *found_entries(result))
+            return result, (("gains", "kc 0.5"), *found_entries(result)), []
 
     monkeypatch.setattr(gains_page, "Proof", Made)
     gains._tuned = object()
