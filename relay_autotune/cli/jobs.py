@@ -132,13 +132,14 @@ def replay(job: Job, working: Working | None = None) -> Done:
     analyses: tuple[Analysis, ...] = ()
     try:
         analyses = analysed(job, said, working)
-        if job.export is not None:
+        if job.export is None:
+            text = _text(job, analyses)
+        else:
             gains, to, text = _exported(analyses, *job.export, doubtful=job.accept_doubtful)
             said += [f"{job.name}: {in_units(each, to.units)}" for each in gains.warnings]
             for each in analyses:
                 if lines := compared_lines(each, job.present, job.table_width or WIDEST):
                     said.append("\n".join([f"{job.name}:", *lines]))
-            return Done(job.name, status_of(analyses), tuple(said), text, analyses=analyses)
     except SelectionError as error:
         command = shlex.join(("replay", *job.paths))
         return _failed(job, said, error.told(command), USAGE)
@@ -156,9 +157,8 @@ def replay(job: Job, working: Working | None = None) -> Done:
         said += [
             f"{job.name}: {'' if a.models else 'nothing identified: '}{a.reason}" for a in analyses
         ]
-    above, text = "", _text(job, analyses)
-    if job.name_width and analyses:
-        above = heading(job.name_width, analyses[0].record.units)
+    is_row = job.name_width and analyses
+    above = heading(job.name_width, analyses[0].record.units) if is_row else ""
     return Done(job.name, status, tuple(said), text, heading=above, analyses=analyses)
 
 

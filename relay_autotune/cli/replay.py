@@ -198,7 +198,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     with_table = not (options.json or options.output)
     recordings = _recordings(options.bags)
     jobs = jobs_of(options, recordings, table_width=width() if with_table else None)
-    jobs = [replace(job, form=options.form) for job in jobs]
+    jobs = [replace(j, form=options.form, accept_doubtful=options.accept_doubtful) for j in jobs]
     if with_table and len(jobs) > 1 and any(recordings_in(Path(name)) for name in options.bags):
         name_width = min(max(len(job.label) for job in jobs), _LONGEST_NAME)
         jobs = [replace(job, name_width=name_width) for job in jobs]
@@ -213,12 +213,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
             )
         if options.json:
             raise SelectionError("--export writes a file of its own: leave out --json")
-        target = export_target(options)
-        jobs = [
-            replace(
-                jobs[0], export=(options.export, target), accept_doubtful=options.accept_doubtful
-            )
-        ]
+        jobs = [replace(jobs[0], export=(options.export, export_target(options)))]
     return jobs
 
 
