@@ -120,6 +120,7 @@ WANG = "--method wang --period-high 1 --period-low 1 --peak-max 1 --peak-min -1 
         ("--method chang --period x", "'x' is not a number"),
         (f"{WANG} --bias 0.1", "also needs --gain, or --mean-measurement and --mean-command"),
         (f"{WANG} --bias 0.1 --structure sopdt", "does not use --structure"),
+        (f"{WANG} --bias 0.1 --gain 0", "--gain is 0, expected any number [y/u] but 0"),
         (
             f"--method chang {EXAMPLE} --dead-time 10 --order -1",
             "order is -1, expected from 0 to 20",
