@@ -92,30 +92,22 @@ def broken(text: str, columns: int) -> list[str]:
     return lines or [""]
 
 
-def paragraphs(text: str, columns: int) -> str:
-    """Return text with its paragraphs filled; lines that begin with a blank stay as they are.
-
-    :param text: lines, as in a docstring.
-    :param columns: that a line may have.
-    """
-    done: list[str] = []
-    words: list[str] = []
-    for line in [*text.splitlines(), ""]:
-        if line[:1].strip():
-            words += line.split()
-            continue
-        if words:
-            done += broken(" ".join(words), columns)
-            words = []
-        done.append(line)
-    return "\n".join(done).strip("\n")
-
-
 class Help(argparse.RawDescriptionHelpFormatter):
     """The help of a command: paragraphs as wide as the terminal, examples as they are."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        return "\n".join(indent + line for line in paragraphs(text, width).splitlines())
+        """Return text with its paragraphs filled; lines that begin with a blank stay."""
+        done: list[str] = []
+        words: list[str] = []
+        for line in [*text.splitlines(), ""]:
+            if line[:1].strip():
+                words += line.split()
+                continue
+            if words:
+                done += broken(" ".join(words), width)
+                words = []
+            done.append(line)
+        return textwrap.indent("\n".join(done).strip("\n"), indent)
 
 
 def labelled(

@@ -164,10 +164,9 @@ class Proof:
         self._gains = gains = gains_from_message(self._message)
         assert record.settings is not None, "gains come of a whole experiment"
         self._rest = rest = record.settings
-        self._within = options.within
         # Without limits the process has seen the levels of the relay.
         self._commands = options.command_within or (rest.low, rest.high)
-        limits = Limits(*self._within), Limits(*self._commands)
+        limits = Limits(*options.within), Limits(*self._commands)
         noise_std = noise_of(record.noise_std, result.transfer_function.residual_rms)
         model = transfer_function_from_message(result.transfer_function)
         self.rate = rate_of(gains.law, gains.law_period)
@@ -189,7 +188,7 @@ class Proof:
         """
         self.allowed.require(step)
         options, rest = self._loop.options, self._rest
-        (low, high), (least, most) = self._within, self._commands
+        (low, high), (least, most) = options.within, self._commands
         runs = ""
         if self.rate is not None:
             runs = f", which runs {self.rate.law.name} every {self.rate.period:g} s,"
@@ -227,7 +226,7 @@ class Proof:
                 "initial_setpoint": rest.setpoint,
                 "initial_command": rest.baseline,
                 "safe_command": rest.baseline,
-                **SETTING["within"].values(self._within),
+                **SETTING["within"].values(loop.options.within),
                 **SETTING["command_within"].values(self._commands),
                 "accept_doubtful": str(doubtful).lower(),
                 "record_directory": journal,
