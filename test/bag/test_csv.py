@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import doctest
+import math
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
@@ -90,6 +91,14 @@ def test_the_one_pair_that_names_allow_is_taken_and_said(tmp_path, names, units,
     assert record.units == units
     _, _, y, u = names
     assert any(f"{y!r} is taken as the measurement and {u!r} as the" in n for n in found.notes)
+
+
+@pytest.mark.parametrize("names", [("T_out", "flow"), ("Ausgang", "Eingang")])
+def test_what_moves_in_steps_is_the_command_where_one_name_alone_speaks(tmp_path, names):
+    rows = [f"{k},{math.sin(0.1 * k):.4f},{50 + 10 * (k // 40 % 2)}" for k in range(200)]
+    text = "\n".join([f"time,{','.join(names)}", *rows])
+    found = read_experiments(write(tmp_path / "a.csv", text))
+    assert set(found.experiments[0].command.tolist()) == {50.0, 60.0}
 
 
 def test_the_examples_of_names_are_true():
