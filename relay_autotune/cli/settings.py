@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import shlex
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -500,6 +501,10 @@ def kind_of(options: argparse.Namespace) -> Kind:
             told = f"{what}: leave it out, since the controller tells it"
         elif Kind.TOPICS in each.loops:
             told = f"a loop without nodes: give {' and '.join(lacking)}, too"
+            if each.name in ("verify", "step") and len(lacking) == 2:
+                where = ["--namespace", options.namespace] * bool(options.namespace)
+                how = shlex.join(["apply_gains", *where])
+                told += f"; where nodes run already, prove the gains with: {how}"
         else:
             told = "a joint: give --controller and --joint, too"
         raise SelectionError(f"{flag_of(each)} is for {told}")

@@ -776,8 +776,15 @@ def test_flags_of_a_new_loop_need_both_topics() -> None:
     given.measurement = None
     assert kind_of(given) is Kind.NODES
     given.law = "simple_pid"
-    with pytest.raises(SelectionError, match=r"--law .*: give --measurement and --command, too"):
+    with pytest.raises(SelectionError, match=r"--law .*: give --measurement and --command, too$"):
         kind_of(given)
+
+
+@pytest.mark.parametrize("flags", [["--verify"], ["--step", "0.5"]])
+def test_a_proof_of_nodes_that_run_names_the_program_that_proves(flags: list[str]) -> None:
+    for words, how in (([], "apply_gains"), (["--namespace", "a"], "apply_gains --namespace a")):
+        with pytest.raises(SelectionError, match=rf"prove the gains with: {how}$"):
+            kind_of(tune_loop._parser().parse_args([*words, *flags]))
 
 
 def test_what_is_given_for_a_loop_whose_nodes_run_goes_to_them_and_the_rest_comes_from_them():
