@@ -139,6 +139,8 @@ class SignalReader:
         self._unfit = 0
         self.why_unfit = ""
         """Why a message has no value, as far as it says."""
+        self.notes: list[str] = []
+        """What to know about it, each a sentence."""
 
     def take(
         self, values: NDArray[Any], good: NDArray[np.bool_], times: IntArray, log_times: IntArray
@@ -177,7 +179,7 @@ class SignalReader:
         :raises BagError: if none of them has one otherwise.
         """
         values, times = self._values.values(), self._times.values()
-        notes: list[str] = []
+        notes = self.notes
         if self._unfit:
             if values.size == 0 and self.why_unfit:
                 raise SelectionError(

@@ -238,10 +238,14 @@ class Topics:
             channels = self._channels(topic)
             stamps = {key: stamp_of(self._type(channel)) for key, channel in channels}
             # A topic without a header, as a command often is, has no such time.
-            clock = self.clock
-            if clock == "header" and None in stamps.values():
-                clock = "publish"
+            headless = self.clock == "header" and None in stamps.values()
+            clock = "publish" if headless else self.clock
             reader = SignalReader(name, clock, both=both, expected=self._expected(name))
+            if headless:
+                reader.notes.append(
+                    f"the messages of {topic} have no header; the times at which they were "
+                    "published are used instead"
+                )
             readers[name] = reader
             for key, channel in channels:
                 path = named_field(self._type(channel), wanted_field, topic)

@@ -105,7 +105,12 @@ def test_the_three_clocks(tmp_path):
 def test_a_topic_without_a_header_keeps_its_publish_times(tmp_path):
     text, data = made("std_msgs/msg/Float64", ros("std_msgs/msg/Float64", 1.0))
     path = write(tmp_path / "bag.mcap", "std_msgs/msg/Float64", text, data)
-    assert read(path, "/topic", "header")[0].time_ns.tolist() == [STAMP]
+    signal, notes = read(path, "/topic", "header")
+    assert signal.time_ns.tolist() == [STAMP]
+    assert notes == (
+        "the messages of /topic have no header; the times at which they were published are used "
+        "instead",
+    )
 
 
 def test_an_element_of_a_sequence_behind_strings(tmp_path):
