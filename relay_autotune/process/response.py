@@ -106,11 +106,11 @@ class _Cluster:
         return list((flat.T @ x * decay).reshape(size, size, -1))
 
     def states(self, gaps: FloatArray, steps: FloatArray, *, backward: bool) -> Coordinates:
-        """Return the states just after each change of the input, shape (n, m)."""
+        """Return the states just after each change of the inputs, shape (n, ..., m)."""
         if not (backward and self.growing):
             return self._followed(gaps, steps)
         # Backward in time, each step is undone before the earlier one is reached.
-        before = self._followed(-gaps[::-1], -steps[::-1])[:, ::-1]
+        before = self._followed(-gaps[::-1], -steps[..., ::-1])[..., ::-1]
         before[-1] += steps
         return before
 
@@ -118,11 +118,11 @@ class _Cluster:
         moved = self.motions(gaps)
         last = len(self.nodes) - 1
         # The drives first, then what follows from them.
-        states = np.zeros((last + 1, kicks.size), dtype=self.rows.dtype)
+        states = np.zeros((last + 1, *kicks.shape), dtype=self.rows.dtype)
         states[last] = kicks
         for k in range(last, -1, -1):
             for m in range(k + 1, last + 1):
-                states[k, 1:] += moved[k][m] * states[m, :-1]
+                states[k, ..., 1:] += moved[k][m] * states[m, ..., :-1]
             states[k] = recursion(moved[k][k], states[k])
         return states
 
@@ -136,15 +136,15 @@ def recursion(decay: Coordinates, drive: Coordinates) -> Coordinates:
     """Return ``x_k = decay_(k-1) x_(k-1) + drive_k``, a triangular system of two bands.
 
     :param decay: of magnitude at most 1, shape (m - 1,).
-    :param drive: shape (m,).
+    :param drive: shape (..., m), of several such systems.
     """
     # Each column of the bands holds a diagonal element, which is one and is not read, and what the
     # next x takes of this one.
-    bands = np.empty((drive.size, 2), dtype=decay.dtype).T
+    bands = np.empty((drive.shape[-1], 2), dtype=decay.dtype).T
     bands[1, :-1] = -decay
     solve = ztbtrs if decay.dtype.kind == "c" else dtbtrs
-    found: Coordinates = solve(bands, drive[:, None], uplo="L", diag="U")[0][:, 0]
-    return found
+    found: Coordinates = solve(bands, drive.reshape(-1, drive.shape[-1]).T, uplo="L", diag="U")[0]
+    return found.T.reshape(drive.shape)
 
 
 def _groups(poles: list[complex], horizon: float) -> list[list[complex]]:
@@ -345,14 +345,14 @@ class Modes:
     def states(
         self, changes: FloatArray, steps: FloatArray, *, backward: bool = False
     ) -> list[Coordinates]:
-        """Return the states just after each change of the input, from rest before the first.
+        """Return the states just after each change of the inputs, from rest before the first.
 
-        :param changes: instants of the changes of the delayed input [s], shape (m,).
-        :param steps: height of each change, shape (m,).
+        :param changes: instants of the changes of the delayed inputs [s], shape (m,).
+        :param steps: height of each change, of one or several inputs, shape (..., m).
         :param backward: True: growing states are followed backward, from zero just after the last
             change, so that they stay bounded; their true motion differs by a multiple of their
             own free motion.
-        :return: of each cluster, shapes (n, m).
+        :return: of each cluster, shapes (n, ..., m).
         """
         gaps = np.diff(changes)
         return [c.states(gaps, steps, backward=backward) for c in self._clusters]
@@ -365,21 +365,22 @@ class Modes:
     ) -> FloatArray:
         """Return the outputs some time after given states.
 
-        :param states: of each cluster, shapes (n, m).
+        :param states: of each cluster, shapes (n, ..., m).
         :param time: since these states [s], shape (k,).
         :param segment: which of the states, shape (k,); None: the first one.
-        :return: shape (p, k).
+        :return: shape (p, ..., k).
         """
         motions: list[FloatArray] = []
         for cluster, own in zip(self._clusters, states, strict=True):
             moved = cluster.motions(time)
-            at = [row[0] if segment is None else row.take(segment) for row in own]
+            at = [row[..., :1] if segment is None else row.take(segment, axis=-1) for row in own]
             for k in range(len(at)):
                 now = moved[k][k] * at[k]
                 for m in range(k + 1, len(at)):
                     now = now + moved[k][m] * at[m]
                 motions += [now.real, now.imag] if now.dtype.kind == "c" else [now]
-        return self._shares @ np.concatenate(motions).reshape(len(motions), -1)
+        found = self._shares @ np.concatenate(motions).reshape(len(motions), -1)
+        return found.reshape(found.shape[0], *motions[0].shape)
 
 
 def _is_upper(group: list[complex]) -> bool:

@@ -64,12 +64,14 @@ DENOMINATORS = {
 def test_derivatives_are_the_limits_of_differences(name):
     denominator, powers, point = DENOMINATORS[name]
     theta = np.array(point)
-    _, derivatives = responses(denominator, powers, theta, TIME, INPUT)
+    ((_, derivatives),) = responses(denominator, powers, theta, TIME, (INPUT,))
     _, free_derivatives = free_motion(denominator, theta, TIME)
     for i in range(theta.size):
         h = np.zeros(theta.size)
         h[i] = 1e-6
-        up, down = (responses(denominator, powers, theta + s * h, TIME, INPUT)[0] for s in (1, -1))
+        up, down = (
+            responses(denominator, powers, theta + s * h, TIME, (INPUT,))[0][0] for s in (1, -1)
+        )
         error = np.abs((up - down) / 2e-6 - derivatives[i])
         # Samples beside a change, which crosses them as the dead time moves, are left out.
         assert np.quantile(error, 0.97) < 1e-5 * (1.0 + np.abs(derivatives[i]).max())
@@ -83,7 +85,7 @@ def test_derivatives_are_the_limits_of_differences(name):
 def test_responses_are_those_of_the_transfer_function(name):
     denominator, powers, point = DENOMINATORS[name]
     theta = np.array(point)
-    found, _ = responses(denominator, powers, theta, TIME, INPUT)
+    ((found, _),) = responses(denominator, powers, theta, TIME, (INPUT,))
     constants = denominator.constants(theta[:-1])
     model = TransferFunction(1.0, (), constants, denominator.integrators, theta[-1])
     np.testing.assert_allclose(found[0], response(model, TIME, INPUT), atol=1e-9)
@@ -98,7 +100,7 @@ def test_responses_to_a_long_staircase_are_those_of_the_transfer_function(name):
     # Slow, and so fast that every change finds the last one settled.
     for faster in (0.0, 3.0):
         theta[: denominator.parameters] -= faster
-        found, _ = responses(denominator, powers, theta, TIME, u)
+        ((found, _),) = responses(denominator, powers, theta, TIME, (u,))
         constants = denominator.constants(theta[:-1])
         model = TransferFunction(1.0, (), constants, denominator.integrators, theta[-1])
         np.testing.assert_allclose(found[0], response(model, TIME, u), atol=1e-9)
@@ -106,8 +108,8 @@ def test_responses_to_a_long_staircase_are_those_of_the_transfer_function(name):
 
 def test_the_closed_form_of_a_lag_is_the_general_one():
     theta = np.array((1.6, 2.03))
-    quick_one = columns_of(FOPDT, theta, TIME, INPUT)
-    general_one = responses(FOPDT.denominator, FOPDT.powers, theta, TIME, INPUT)
+    (quick_one,) = columns_of(FOPDT, theta, TIME, (INPUT,))
+    (general_one,) = responses(FOPDT.denominator, FOPDT.powers, theta, TIME, (INPUT,))
     for quick, general in zip(quick_one, general_one, strict=True):
         np.testing.assert_allclose(quick, general, atol=1e-12)
 

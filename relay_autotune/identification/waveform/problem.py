@@ -227,16 +227,20 @@ class Problem:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return one experiment's columns with their derivatives, and its straight line."""
         time = self.time[part]
-        blocks = [columns_of(self.structure, theta, time, self.inputs[number])]
+        inputs = (self.inputs[number], *self.further_inputs(number))
+        first, *further = columns_of(self.structure, theta, time, inputs)
+        blocks = [first]
         if self.relaxation or self.structure.unstable:
             growing_only = not self.relaxation
             blocks.append(
                 free_motion(self.structure.denominator, theta, time, growing_only=growing_only)
             )
         if self.friction:
-            blocks += [self._at_once(theta, time, seen) for seen in self.motions]
-        further = self.further_inputs(number)
-        blocks += [columns_of(self.structure, theta, time, u) for u in further]
+            at_once = np.append(theta[:-1], 0.0)
+            for columns, by_theta in columns_of(self.structure, at_once, time, self.motions):
+                by_theta[-1] = 0.0
+                blocks.append((columns, by_theta))
+        blocks += further
         rest = self.line(time)
         if len(blocks) == 1:
             return *blocks[0], rest
@@ -269,14 +273,6 @@ class Problem:
         if self.drift:
             rows[1] = (time - time.mean()) / np.ptp(time)
         return rows
-
-    def _at_once(
-        self, theta: FloatArray, time: FloatArray, u: PiecewiseConstant
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the response to an input that acts without dead time, with its derivatives."""
-        columns, by_theta = columns_of(self.structure, np.append(theta[:-1], 0.0), time, u)
-        by_theta[-1] = 0.0
-        return columns, by_theta
 
     def seen(self, rows: FloatArray) -> FloatArray:
         """Return rows multiplied by the samples' weights, and whitened by the noise's colour.

@@ -9,6 +9,7 @@ Theta is the logarithms of the parameters of the factors of a structure, then th
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -25,18 +26,19 @@ _LOG_RANGE = 30.0
 
 
 def columns_of(
-    structure: Structure, theta: FloatArray, time: FloatArray, u: Input
-) -> tuple[FloatArray, FloatArray]:
-    """Return the responses of a structure, shape (k, n), and their derivatives, shape (m, k, n).
+    structure: Structure, theta: FloatArray, time: FloatArray, inputs: Sequence[Input]
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return a structure's responses to each input, shape (k, n), and derivatives, (m, k, n).
 
     :param structure: the structure.
     :param theta: shape (m,).
     :param time: sample times [s], shape (n,).
-    :param u: the input; its deviation from ``u.initial`` acts.
+    :param inputs: the deviation of each from its ``initial`` acts.
     """
-    if structure == FOPDT and isinstance(u, PiecewiseConstant):
-        return one_lag(theta, time, u)
-    return responses(structure.denominator, structure.powers, theta, time, u)
+    held = [u for u in inputs if isinstance(u, PiecewiseConstant)]
+    if structure == FOPDT and len(held) == len(inputs):
+        return [one_lag(theta, time, u) for u in held]
+    return responses(structure.denominator, structure.powers, theta, time, inputs)
 
 
 def unit_steps(structure: Structure, theta: FloatArray, least: float = 0.0) -> FloatArray:
@@ -139,9 +141,9 @@ def responses(
     powers: tuple[int, ...],
     theta: FloatArray,
     time: FloatArray,
-    u: Input,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the responses of ``s^k exp(-D s)/(s^m Q)`` and their derivatives.
+    inputs: Sequence[Input],
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the responses of ``s^k exp(-D s)/(s^m Q)`` to each input, and their derivatives.
 
     Growing modes are followed backward from zero at the last sample, so that they stay bounded;
     the free motion that this leaves out has a column of its own, from :func:`free_motion`.
@@ -150,28 +152,33 @@ def responses(
     :param powers: k of each response, p of them.
     :param theta: the parameters of the denominator, then D [s].
     :param time: sample times, not decreasing [s], shape (n,).
-    :param u: the input; its deviation from ``u.initial`` acts, of ramps as exactly as of steps.
-    :return: shapes (p, n) and (len(theta), p, n).
+    :param inputs: the deviation of each from its ``initial`` acts, of ramps as exactly as of
+        steps; only the first one may be of ramps.
+    :return: of each input shapes (p, n) and (len(theta), p, n).
     """
     own, dead_time = theta[:-1], float(theta[-1])
-    changes = u.times + dead_time
-    ramps = isinstance(u, PiecewiseLinear)
-    # A ramp is a step that is integrated once more.
-    before, levels = (0.0, u.slopes) if isinstance(u, PiecewiseLinear) else (u.initial, u.values)
-    steps = levels.copy()
-    steps[:1] -= before
-    steps[1:] -= levels[:-1]
+    ramps = isinstance(inputs[0], PiecewiseLinear)
+    if ramps and len(inputs) > 1:
+        alone = responses(denominator, powers, theta, time, inputs[:1])
+        return alone + responses(denominator, powers, theta, time, inputs[1:])
+    at = np.unique(np.concatenate([u.times for u in inputs]))
+    steps = np.zeros((len(inputs), at.size))
+    for row, u in zip(steps, inputs, strict=True):
+        # A ramp is a step that is integrated once more.
+        levels = u.levels if isinstance(u, PiecewiseConstant) else np.append(0.0, u.slopes)
+        row[at.searchsorted(u.times)] = np.diff(levels)
+    changes = at + dead_time
     unstable = any(f.unstable for f in denominator.factors)
     if unstable:
         first, last = min(time[0], changes[0]) - 1.0, max(time[-1], changes[-1]) + 1e-9
         changes = np.concatenate(([first], changes, [last]))
-        steps = np.concatenate(([0.0], steps, [0.0]))
+        steps = np.pad(steps, ((0, 0), (1, 1)))
     numerators = denominator.numerators(own, powers)
     values = _follow(
         denominator, own, numerators, time, changes, steps, backward=unstable, ramps=ramps
     )
-    p = len(powers)
-    return values[:p], values[p:].reshape(theta.size, p, time.size)
+    p, shape = len(powers), (theta.size, len(powers), time.size)
+    return [(values[:p, i], values[p:, i].reshape(shape)) for i in range(len(inputs))]
 
 
 def free_motion(
@@ -205,7 +212,7 @@ def free_motion(
             # An impulse is the derivative of a step: one power of s higher.
             powers = tuple(range(1, single.order + 1))
             numerators = single.numerators(part, powers, by_dead_time=False)
-            values = _follow(single, part, numerators, time, time[:1], np.ones(1))
+            values = _follow(single, part, numerators, time, time[:1], np.ones((1, 1)))[:, 0]
             found = values[: single.order]
             changes = values[single.order :].reshape(-1, *found.shape)
         all_changes = np.zeros((theta.size, *found.shape))
@@ -228,16 +235,16 @@ def _follow(
     backward: bool = False,
     ramps: bool = False,
 ) -> FloatArray:
-    """Return the outputs at the samples, shape (outputs, n); zero before the first change."""
+    """Return the outputs at the samples, zero before the first change, (outputs, inputs, n)."""
     horizon = max(float(max(time[-1], changes[-1]) - changes[0]), np.finfo(float).tiny)
     constants = denominator.constants(own, 1)
     modes = Modes(constants, denominator.integrators + ramps, numerators, horizon)
     states = modes.states(changes, steps, backward=backward)
     segment = changes.searchsorted(time, side="right") - 1
-    values = np.zeros((numerators.shape[0], time.size))
+    values = np.zeros((numerators.shape[0], steps.shape[0], time.size))
     # In pieces, so that a long record takes little memory beside its result.
     for start in range(int(segment.searchsorted(0)), time.size, _CHUNK):
         part = slice(start, start + _CHUNK)
         since = time[part] - changes[segment[part]]
-        values[:, part] = modes.outputs(states, since, segment[part])
+        values[..., part] = modes.outputs(states, since, segment[part])
     return values

@@ -328,7 +328,7 @@ def shifted_columns(
     :return: shape (k, rows, n).
     """
     order = np.argsort(moved, axis=None, kind="stable")
-    columns, _ = columns_of(structure, theta, moved.ravel()[order], u)
+    columns = columns_of(structure, theta, moved.ravel()[order], (u,))[0][0]
     found = np.empty_like(columns)
     found[:, order] = columns
     return found.reshape(-1, *moved.shape)
