@@ -256,7 +256,7 @@ class Identification:
         if not any(rival.support > self.support for rival in self.rivals):
             return ""
         return (
-            f"the simplest structure that the record does not refute is taken, with "
+            f"the structure of the best score is taken, which in coloured noise has "
             f"{percent(self.support)} % of the support; the models on 95 % of which gains hold "
             "are of all of them, by their support"
         )

@@ -98,7 +98,7 @@ def test_it_is_said_why_a_rival_of_more_support_is_not_taken(monkeypatch):
     for support, told in ((0.13, True), (0.9, False)):
         chosen = replace(model, support=support, rivals=rivals)
         shown = replace(found, models=(chosen, *others))
-        said = "the simplest structure that the record does not refute is taken, with 13 % of"
+        said = "the structure of the best score is taken, which in coloured noise has 13 % of"
         assert (said in " ".join(table("tank", [shown]).split())) == told
         case = replace(case_of(shown, "tank"), record=None, models_around=())
         assert (said.capitalize() in page([case])) == told

@@ -32,7 +32,7 @@ from relay_autotune.identification.waveform.choice import (
 )
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.problem import Problem, problem_of
-from relay_autotune.identification.waveform.residuals import colour_cost, colour_of, slow_colour
+from relay_autotune.identification.waveform.residuals import Colour, colour_cost, colour_of
 from relay_autotune.identification.waveform.separable import evaluate
 from relay_autotune.identification.waveform.starts import start_fopdt
 from relay_autotune.process.response import response
@@ -118,10 +118,8 @@ def test_a_colour_makes_its_own_noise_white():
     assert colour.log_determinant == pytest.approx(log_determinant, abs=1e-9)
 
 
-def test_a_slow_disturbance_as_a_colour():
-    colour = slow_colour(1000)
-    variance = 1.0 / (1.0 - 0.99**2)
-    assert colour.whitened(np.array([1.0, 0.0])) == pytest.approx([variance**-0.5, -0.99])
+def first_order(pole: float) -> Colour:
+    return Colour(np.array([pole]), np.array([[math.sqrt(1.0 - pole**2)]]))
 
 
 def test_noise_that_wanders_like_a_drift_pays_for_it() -> None:
@@ -129,7 +127,7 @@ def test_noise_that_wanders_like_a_drift_pays_for_it() -> None:
     noise = np.random.default_rng(0).standard_normal(1000)
     ringing = colour_of([lfilter([1.0], [1.0, -1.6, 0.998], noise)])
     assert ringing is not None
-    for colour, price in ((slow_colour(2000), 10.0), (slow_colour(500), 0.0), (ringing, 0.0)):
+    for colour, price in ((first_order(0.995), 10.0), (first_order(0.98), 0.0), (ringing, 0.0)):
         criterion = colour.log_determinant + colour.order * math.log(1000)
         assert colour_cost(colour, 1000) == pytest.approx(criterion + price)
 
@@ -238,9 +236,9 @@ def test_a_process_that_visibly_rested_needs_no_past():
 
 
 def test_the_simulation_shows_the_direction(monkeypatch):
-    """In the colour of a slow disturbance an inverse response had the better score."""
+    """In a slow colour an inverse response had the better score."""
     right = fitted_to_two_steps()
-    problem = replace(right.problem, colour=slow_colour(1000))
+    problem = replace(right.problem, colour=first_order(0.99))
     bent = replace(right.state, coefficients=right.state.coefficients * (-1.0, 1.0))
     turned = replace(
         right,

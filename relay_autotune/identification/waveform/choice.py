@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
@@ -37,7 +37,6 @@ from relay_autotune.identification.waveform.residuals import (
     colour_cost,
     colour_of,
     ljung_box,
-    slow_colour,
 )
 from relay_autotune.identification.waveform.separable import (
     Trial,
@@ -97,8 +96,6 @@ _ALIKE = 0.01
 # of command and measurement that belong together it refused 4 whose gains were trusted, and of 90
 # that do not, 23 of the 43 with gains.
 _ANSWERED = 20.0
-# Scores that differ by less do not tell two structures apart.
-_INDIFFERENT = 2.0
 # Mean square that a model in colour may leave, over that of the best simulation: a colour near a
 # random walk explains the response itself. Of 50 records with every kind of noise and a process
 # that is not linear, the right model left up to 3.6 times as much (benchmarks/unmodelled.py).
@@ -153,7 +150,8 @@ def chosen_fit(
     ]
     fits: list[Fit] = []
     for group in (own, simulated):
-        finished = (_finished(c, found, problem, scale) for c in _by_rank(group))
+        ranked = sorted(group, key=lambda c: c.score)
+        finished = (_finished(c, found, problem, scale) for c in ranked)
         fits += itertools.islice((fit for fit in finished if fit is not None), 1)
     if not fits:
         raise no_response(known)
@@ -398,9 +396,8 @@ def _in_own_colour(context: FitContext, candidate: Candidate) -> Candidate:
 def _likeliest_colour(context: FitContext, simulated: list[Candidate]) -> list[Candidate]:
     """Return structures in the likeliest colour of the best one, the best first.
 
-    The colour is found from two starts: the residual of the best simulation, and a slow
-    disturbance, which a simulation would follow. It counts where its best model simulates the
-    record about as well as the best simulation of all does.
+    The colour counts where its best model simulates the record about as well as the best
+    simulation of all does.
 
     :param simulated: fitted to the measurement itself.
     """
@@ -410,11 +407,9 @@ def _likeliest_colour(context: FitContext, simulated: list[Candidate]) -> list[C
     own = _colour(simulated[0].problem, simulated[0].state)
     if own is None:
         return simulated
-    slow = slow_colour(context.problem.time.size)
-    ends = (_converged(_in(colour, simulated, context), context) for colour in (own, slow))
+    found = _converged(_in(own, simulated, context), context)
     least = min(c.state.cost / c.problem.time.size for c in simulated)
-    likely = [end for end in ends if end and _simulates(end[0], least)]
-    return min(likely, key=lambda end: end[0].score, default=simulated)
+    return found if found and _simulates(found[0], least) else simulated
 
 
 def _converged(found: list[Candidate], context: FitContext) -> list[Candidate]:
@@ -470,16 +465,6 @@ def _simulates(candidate: Candidate, least: float) -> bool:
         candidate.problem, candidate.state.coefficients, candidate.state.theta
     )
     return left**2 <= _WORSE * least
-
-
-def _by_rank(found: list[Candidate]) -> Iterable[Candidate]:
-    """Yield candidates, the one to choose first: the simplest that the score does not refuse."""
-    rest = sorted(found, key=lambda c: c.score)
-    while rest:
-        near = [c for c in rest if c.score <= rest[0].score + _INDIFFERENT]
-        chosen = min(near, key=lambda c: (c.state.parameters, c.structure.order, c.score))
-        yield chosen
-        rest = [c for c in rest if c is not chosen]
 
 
 def _finished(

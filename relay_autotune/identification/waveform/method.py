@@ -85,8 +85,8 @@ def identify_waveform(record: Record, known: Known = NOTHING) -> Identification:
     """Identify a model from all samples of a record.
 
     :param record: any record whose command moves; baseline samples before the test help.
-    :param known: its structure is fitted; by default the simplest that explains the data. Its
-        loss is minimised.
+    :param known: its structure is fitted; by default that of the best score. Its loss is
+        minimised.
     :raises IdentificationError: if the record holds too little, or no response to the command.
     """
     return identify_waveform_jointly((record,), known)

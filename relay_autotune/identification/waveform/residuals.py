@@ -185,15 +185,6 @@ def colour_cost(colour: Colour | None, samples: int) -> float:
     return colour.log_determinant + colour.order * math.log(samples) + IMITATES_A_DRIFT * wanders
 
 
-def slow_colour(samples: int) -> Colour:
-    """Return the colour of a slow disturbance, an autoregression of first order.
-
-    :param samples: of the record, ten correlation times of it.
-    """
-    pole = 1.0 - _SLOWEST / samples
-    return Colour(np.array([pole]), np.array([[math.sqrt(1.0 - pole**2)]]))
-
-
 def colour_of(parts: Sequence[FloatArray]) -> Colour | None:
     """Return the colour of residuals: Burg's autoregression of the order that BIC prefers.
 
