@@ -410,6 +410,22 @@ def test_a_jump_in_the_last_samples_is_left_out():
     assert any("the last" in w and "were left out" in w for w in found.warnings)
 
 
+@pytest.mark.parametrize(("late", "hides"), [(4.5, True), (1.0, False)])
+def test_a_command_that_is_recorded_late_hides_the_dead_time(late, hides):
+    time = np.arange(0.0, 400.0, 0.5)
+    process = TransferFunction.fopdt(1.5, 15.0, 3.0)
+    u = PiecewiseConstant(np.array([50.0, 120.0, 190.0, 260.0]), np.array([1.0, 0, 1, 0]), 0.0)
+    y = response(process, time, u) + 0.01 * np.random.default_rng(1).standard_normal(time.size)
+    record = Record(time, y, replace(u, times=u.times + late)(time))
+    if hides:
+        with pytest.raises(
+            IdentificationError, match=r"moves 1\.\d s before the recorded command"
+        ):
+            identify_waveform(record)
+    else:
+        assert identify_waveform(record).model.dead_time == pytest.approx(2.0, abs=0.1)
+
+
 def test_an_ultimate_point_beyond_the_rate_of_the_samples_is_not_determined():
     time = np.arange(0.0, 20.0, 0.1)
     u = PiecewiseConstant(np.array([2.0, 9.0]), np.array([1.0, 0.0]), 0.0)

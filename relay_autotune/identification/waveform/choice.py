@@ -39,6 +39,7 @@ from relay_autotune.identification.waveform.residuals import (
     ljung_box,
 )
 from relay_autotune.identification.waveform.separable import (
+    TRIAL,
     Trial,
     information_criterion,
     left_in_simulation,
@@ -100,6 +101,9 @@ _ANSWERED = 20.0
 # random walk explains the response itself. Of 50 records with every kind of noise and a process
 # that is not linear, the right model left up to 3.6 times as much (benchmarks/unmodelled.py).
 _WORSE = 6.0
+# Samples by which a measurement may be ahead of the command: of the one in its own row, which may
+# have acted since the row before, and one more for what the structure lacks. Those that are tried.
+_ROWS, _AHEAD = 2.0, 20.0
 # Longest dead time as a share of the time after the first change of the command: what came later
 # has nothing to confirm it, and may be of the past.
 _LATEST = 0.5
@@ -213,6 +217,34 @@ def outweighs_disturbance(problem: Problem, state: Trial) -> bool:
         _odds(white.thinned(most), state.theta, problem.colour) > _ANSWERED
         for most in (_MOST, some)
     )
+
+
+def ahead_of_command(problem: Problem, state: Trial) -> float:
+    """Return by how long the measurement is ahead of the recorded command [s]; 0: it follows.
+
+    It is where a FOPDT or SOPDT of a command that came earlier explains more than a model without
+    a dead time does.
+
+    :param problem: what was fitted.
+    :param state: its fit.
+    """
+    if state.theta[-1] >= problem.shortest:
+        return 0.0
+    earlier = _AHEAD * problem.shortest
+    earlier = float(unit_steps(problem.structure, state.theta, earlier)[-1])
+    inputs = tuple(replace(u, times=u.times - earlier) for u in problem.inputs)
+    moved = replace(problem, inputs=inputs, structure=FOPDT, colour=None)
+    n, floor = problem.time.size, problem.time.size * NEGLIGIBLE**2
+
+    def score(of: Trial) -> float:
+        return information_criterion(of.cost, n, of.parameters, floor)
+
+    for c in FitContext.of(moved, 0, held=True).fit(PLAIN):
+        own = refine(replace(c.problem, colour=problem.colour), c.state.theta, tolerance=TRIAL)
+        by = earlier - float(own.theta[-1])
+        if by > _ROWS * problem.shortest and score(state) - score(own) > _ANSWERED:
+            return by
+    return 0.0
 
 
 def _odds(problem: Problem, theta: FloatArray, colour: Colour | None) -> float:

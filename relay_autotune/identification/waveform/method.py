@@ -29,6 +29,7 @@ from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.choice import (
     SIMPLE,
     TRIED,
+    ahead_of_command,
     chosen_fit,
     names_near,
     no_response,
@@ -53,7 +54,7 @@ from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, TABLE
 from relay_autotune.record.excitation import at_its_ends, changes_within, smooth
 from relay_autotune.record.record import Input, PiecewiseConstant, Record, roughness
-from relay_autotune.text import counted
+from relay_autotune.text import counted, digits
 
 # Number of samples from which even a coarse measurement takes more than two values, and how many
 # times as often as it the command moves where the two are exchanged: in 90 recordings of plants
@@ -163,6 +164,12 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
     fit = _spared_of_outliers(problem, fit, known, chosen)
     if not outweighs_disturbance(fit.problem, fit.state):
         raise no_response(known)
+    if not held and (ahead := ahead_of_command(fit.problem, fit.state)):
+        raise IdentificationError(
+            f"the measurement moves {digits(ahead, 2)} s before the recorded command, which is "
+            "recorded late and hides the dead time: record it when it is sent, on the clock of "
+            "the measurement"
+        )
     return replace(fit, warnings=(*fit.warnings, stopped)) if stopped else fit
 
 
