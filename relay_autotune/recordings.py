@@ -229,7 +229,11 @@ def _missing_rows(record: Record) -> list[str]:
     gaps = gaps_of(record)
     if not gaps.before.size:
         return []
-    told = f"gaps in the rows: {gaps.before.size}, the longest {gaps.longest:.3g} s"
+    told = (
+        f"gaps in the rows: {gaps.before.size}, the longest {gaps.longest:.3g} s, the first after "
+        f"{record.time[gaps.before[0] - 1]:g} s (if a clock jumped, leave one side out with "
+        "--start or --end)"
+    )
     if gaps.hidden.size:
         end = record.time[gaps.hidden[0]]
         told += (

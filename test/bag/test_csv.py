@@ -101,6 +101,14 @@ def test_what_moves_in_steps_is_the_command_where_one_name_alone_speaks(tmp_path
     assert set(found.experiments[0].command.tolist()) == {50.0, 60.0}
 
 
+def test_a_gap_where_a_clock_may_have_jumped_is_told_with_its_time(tmp_path):
+    rows = (f"{k + 15 * (k > 60)},{math.sin(0.1 * k):.4f},{k // 40 % 2}" for k in range(200))
+    found = read_experiments(write(tmp_path / "a.csv", "\n".join(["time,y,u", *rows])))
+    assert any(
+        "the longest 16 s, the first after 60 s (if a clock" in note for note in found.notes
+    )
+
+
 def test_the_examples_of_names_are_true():
     assert doctest.testmod(words).failed == 0
 
