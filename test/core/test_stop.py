@@ -60,3 +60,10 @@ def test_what_lies_at_the_end_of_a_sensor_is_left_out():
 def test_a_process_that_comes_to_rest_stands_at_no_stop(model, changes, levels):
     known = Known(structure=model.structure)
     assert not told_of_a_stop(identify(recorded(model, changes, levels), known=known))
+
+
+def test_a_process_that_came_to_rest_in_a_gap_of_the_rows_stands_at_no_stop():
+    whole = recorded(LAG, [3.0, 8.0], [1.0, 0.0])
+    kept = (TIME < 3.8) | (TIME > 6.5)
+    record = Record(TIME[kept], whole.measurement[kept], whole.command[kept])
+    assert not told_of_a_stop(identify(record, known=Known(structure="fopdt")))

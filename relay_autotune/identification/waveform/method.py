@@ -200,7 +200,7 @@ def _before_stop(problem: Problem, chosen: Choose) -> tuple[Problem, str]:
         model = fit.problem.structure.model_at(fit.state.theta, fit.state.coefficients)
         if model is None or model.grows:
             continue
-        on = response(model, problem.time[begin - 1 : stop], u)
+        on = response(model, problem.time[begin:stop], u)
         if float(np.median(on[1:] - on[0])) / away > 1.0:
             return before, (
                 f"from {problem.time[begin]:.4g} s on the measurement stays at an end of its "
