@@ -58,6 +58,8 @@ PROGRAM = "apply_gains"
 # What a verification has found: names and texts.
 Entries = tuple[tuple[str, str], ...]
 
+# With any other reason, a proof that did not pass has ended without a verdict.
+_FAILURES = (Code.NOT_AS_PREDICTED, Code.STEP_RAN_AWAY, Code.STEP_OUT_OF_RANGE)
 # An uncertainty of the overshoot that is worth showing, as a fraction of the step.
 _SEEN = 0.03
 # How long a verification waits until the loop is at rest [s].
@@ -297,7 +299,8 @@ def found_entries(result: Any) -> Entries:
     """
     from relay_autotune.control.verification import SETTLED
 
-    told = f"failed: {result.reason}"
+    failed = reason_from_message(result.why).code in _FAILURES
+    told = f"{'failed' if failed else 'none'}: {result.reason}"
     if result.passed:
         told = "passed: the loop does what the model predicts"
     whys = [reason_from_message(step.why) for step in result.steps]

@@ -176,10 +176,18 @@ def test_what_passed_close_to_a_limit_is_called_narrow() -> None:
 
 def test_a_verdict_that_failed_says_why_and_which_gains_are_back() -> None:
     failed = Verify.Result(passed=False, reason="it settles later; kc 0.1 in force again")
+    fill_reason(failed.why, Code.NOT_AS_PREDICTED(problems="it settles later", numbers="numbers"))
     text = "\n".join(laid_out(verdict_entries(failed, Controller(0.1, 3.0)), 60))
     assert "failed: it settles later" in text
     assert "kc 0.1000" in text and "--revert" not in text
     assert "the command is held" in "\n".join(laid_out(verdict_entries(failed, None), 60))
+
+
+def test_a_proof_that_is_cut_short_is_not_said_to_have_failed() -> None:
+    why = Code.INTERFERED(sentence="the set-point was changed to 43 by another node")
+    ended = Verify.Result(passed=False, reason=str(why))
+    fill_reason(ended.why, why)
+    assert found_entries(ended) == (("verdict", f"none: {why}"),)
 
 
 @dataclass(frozen=True)
