@@ -33,6 +33,7 @@ from relay_autotune.bag.words import (
     is_date,
     is_time,
     role_of,
+    tag_of,
     unit_in,
     without_unit,
 )
@@ -505,7 +506,9 @@ def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[_Pair]:
         for name, hinted in zip(given, hints, strict=True)
     ]
     found = [_Pair(y, u, all(hints)) for y in pair[0] for u in pair[1] if y != u]
-    return found[:_MOST_CHOICES]
+    # Of a plant's columns, those of one loop belong together.
+    of_one = [each for each in found if tag_of(each.measurement) == tag_of(each.command) != ""]
+    return (of_one or found)[:_MOST_CHOICES]
 
 
 def _swap(path: Path, names: Sequence[str], first: FloatArray, second: FloatArray) -> str:

@@ -79,6 +79,16 @@ def role_of(name: str) -> str | None:
     return parts.pop() if len(parts) == 1 else None
 
 
+def tag_of(name: str) -> str:
+    """Return a name without the word that says its role, with digits; empty: it has no other.
+
+    >>> tag_of("TIC-101.PV (degC)"), tag_of("OUT TIC-101"), tag_of("Heater (%)")
+    ('tic 101', 'tic 101', '')
+    """
+    words = re.findall(r"[^\W_]+", without_unit(name).casefold())
+    return " ".join(word for word in words if role_of(word) is None)
+
+
 def _said(words: frozenset[str], table: Mapping[str, str]) -> list[str]:
     return [role for role, known in table.items() if not words.isdisjoint(known.split())]
 

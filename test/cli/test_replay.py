@@ -34,7 +34,7 @@ from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, Definition
 from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
 from relay_autotune.cli import csv_to_bag, replay, terminal, tune
-from relay_autotune.errors import BagError, NotThereError
+from relay_autotune.errors import BagError, NotThereError, SelectionError
 from relay_autotune.exchange.export import EXPORTS
 from relay_autotune.record.record import Outcome, Record
 from relay_autotune.recordings import read_experiments
@@ -340,6 +340,23 @@ def test_columns_whose_names_tell_what_they_are_need_no_flags(tmp_path):
     assert "--measurement and --command name others" in note
     (log,) = read_csv(path, Selection(command="FIC101.SP"))
     assert (log.measurement.name, log.command.name) == ("FIC101.PV", "FIC101.SP")
+
+
+def test_columns_of_two_loops_are_paired_by_their_tag(tmp_path):
+    path = tmp_path / "plant.csv"
+    head = "t,TIC-101.PV,TIC-101.OUT,TIC-102.PV,TIC-102.OUT"
+    rows = [f"{k},{k % 7},{k // 9 % 2},{k % 5},{k // 8 % 2}" for k in range(40)]
+    path.write_text("\n".join([head, *rows]))
+    with pytest.raises(SelectionError) as caught:
+        read_csv(path, Selection())
+    assert [line.strip() for line in str(caught.value).splitlines()[1:]] == [
+        f"--measurement TIC-{k}.PV --command TIC-{k}.OUT  # as their names say" for k in (101, 102)
+    ]
+    (log,) = read_csv(path, Selection(measurement="TIC-102.PV"))
+    assert log.command.name == "TIC-102.OUT"
+    path.write_text("\n".join([head.replace("TIC-102.PV", "alarm"), *rows]))
+    (log,) = read_csv(path, Selection())
+    assert (log.measurement.name, log.command.name) == ("TIC-101.PV", "TIC-101.OUT")
 
 
 def test_everything_is_told_in_the_units_of_the_recording(tmp_path, capsys, monkeypatch):
