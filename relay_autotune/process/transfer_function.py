@@ -217,7 +217,7 @@ class TransferFunction:
             if c.size == 0 or not bool(np.all(np.isfinite(c))):
                 raise ModelError(
                     f"the {name} needs finite coefficients that are not all zero, "
-                    f"found {list(np.atleast_1d(given))}"
+                    f"found {np.atleast_1d(given).tolist()}"
                 )
             stripped = np.trim_zeros(c, "b")
             integrators = c.size - stripped.size - integrators

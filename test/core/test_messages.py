@@ -262,6 +262,7 @@ def model_message(**changes: Any) -> SimpleNamespace:
     [
         ({"numerator": [math.nan]}, "finite"),
         ({"denominator": []}, "finite coefficients"),
+        ({"denominator": [0, 0]}, r"not all zero, found \[0(\.0)?, 0(\.0)?\]"),
         ({"denominator": [1.0] * 200}, "50 at most"),
         ({"dead_time": -1.0}, "dead time"),
         ({"dead_time": math.inf}, "finite"),
