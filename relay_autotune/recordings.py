@@ -487,14 +487,15 @@ def window(record: Record, start: float | None, end: float | None) -> list[Recor
 
 
 def _check(signal: Signal, role: str) -> None:
+    name = role if signal.name == role else f"{role} {signal.name}"
     if len(signal) == 0:
-        raise BagError(f"the {role} {signal.name} holds no value")
+        raise BagError(f"the {name} holds no value")
     # NaN compares as False.
     wrong = np.flatnonzero(~(np.abs(signal.values) <= LARGEST_VALUE))
     if wrong.size:
         where = (signal.time_ns[wrong[0]] - signal.time_ns[0]) / 1e9
         raise BagError(
-            f"the {role} {signal.name} is {signal.values[wrong[0]]} at {where:g} s "
+            f"the {name} is {signal.values[wrong[0]]} at {where:g} s "
             f"({wrong.size} of {len(signal)} values are not finite, or beyond "
             f"{LARGEST_VALUE:g}, which no quantity is); leave such a stretch out of the "
             f"recording"
@@ -505,7 +506,7 @@ def _check(signal: Signal, role: str) -> None:
             what = "never changes"
             remedy = "; if it was another before the recording, give that as --command-before"
         raise BagError(
-            f"the {role} {signal.name} {what} ({signal.values[0]:g} in all of {len(signal)} "
+            f"the {name} {what} ({signal.values[0]:g} in all of {len(signal)} "
             f"values): nothing can be identified from it{remedy}"
         )
 

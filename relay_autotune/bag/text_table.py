@@ -44,6 +44,8 @@ _COMMAS = (
     ": where commas separate columns, a number has none; save the table with decimal points and "
     "without separators of thousands, or with semicolons between columns"
 )
+_GROUPED = "; save the table without separators of thousands"
+_GROUPS = re.compile(r"[+-]?\d{1,3}([.,'\u2019\s]\d{3})+([.,]\d+)?")
 _MISSING = frozenset(("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--"))
 _SWITCH = {"on": 1.0, "off": 0.0, "true": 1.0, "false": 0.0}
 _QUANTITY = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*(%|[^\W\d_/]{1,4}|\u00b0\w?)")
@@ -369,7 +371,7 @@ class TextTable:
     def _no_number(self, line: int, at: int, cell: str, *, finite: bool = False) -> BagError:
         shown = cell if finite else repr(visible(cell))
         between = self._separator == "," and "," in cell and _is_number(cell.replace(",", ""))
-        hint = _COMMAS if between else ""
+        hint = _COMMAS if between else _GROUPED * bool(_GROUPS.fullmatch(cell))
         return BagError(
             f"{self._path}, line {line}: {self.names[at]!r} is {shown}; expected a "
             f"{'finite ' if finite else ''}number{hint}"

@@ -186,7 +186,11 @@ def test_dates_in_seconds_become_the_start(tmp_path):
             "t;y;u\n0;1,5;2\n1;1.5;2\n",
             "a decimal comma and others with a point, such as '1,5' in line 2 and '1.5' in line 3",
         ),
-        ("t;y;u\n0;1.000,5;2\n1;2;2\n", r"line 2: 'y' is '1.000,5'; expected a number"),
+        (
+            "t;y;u\n0;1.000,5;2\n1;2;2\n",
+            r"line 2: 'y' is '1.000,5'; expected a number; save .*thousands",
+        ),
+        ("t;y;u\n0;1'000.5;2\n1;2;2\n", "expected a number; save .*without separators of thous"),
         ("t,y,u\n0,1,2\n2026-01-01T00:00:00,2,1\n", "of 2 cells of 't' 1 are dates"),
         ("t,y,u\n" + "0" * (1 << 20) + ",1,2\n", "a line of more than 1048576 characters"),
         ("t,y,u\n", "has fewer than two rows of numbers"),
@@ -196,6 +200,8 @@ def test_dates_in_seconds_become_the_start(tmp_path):
         ("t,y,u\n0,1,2\n1e18,2,3\n", "expected a time in seconds"),
         ("t,y,u\n0,1,2\n1,1,3\n", r"the measurement y is constant \(1 in all of 2 values\)"),
         ("t,y,u\n0,1,2\n1,4,2\n", r"the command u never changes \(2 in all of 2 values\)"),
+        ("t,measurement,u\n0,nan,2\n1,nan,3\n", "^the measurement holds no value"),
+        ("t,y,command\n0,1,2\n1,4,2\n", "^the command never changes"),
     ],
 )
 def test_bad_content_is_a_sentence(tmp_path, text, sentence):
