@@ -523,10 +523,11 @@ def _swap(path: Path, names: Sequence[str], first: FloatArray, second: FloatArra
                 "the controller put out; name columns with --measurement and --command if it is"
             )
     roles = [role_of(name) for name in names]
-    in_steps = _steps(first), _steps(second)
-    # One name alone may be that of a part on either side: "T_out" and "flow", or "Ausgang".
-    if in_steps[0] != in_steps[1] and (None in roles or roles[0] == roles[1]):
-        return "since it moves in steps" if in_steps[0] else ""
+    if set(roles) != {MEASUREMENT, COMMAND}:
+        # One name alone may be that of a part on either side: "T_out" and "flow", or "Ausgang".
+        in_steps = _steps(first), _steps(second)
+        if in_steps[0] != in_steps[1]:
+            return "since it moves in steps" if in_steps[0] else ""
     swapped = roles[0] != roles[1] and (roles[0] == COMMAND or roles[1] == MEASUREMENT)
     return "as their names say" if swapped else ""
 

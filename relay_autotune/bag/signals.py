@@ -179,7 +179,7 @@ class SignalReader:
         :raises BagError: if none of them has one otherwise.
         """
         values, times = self._values.values(), self._times.values()
-        notes = self.notes
+        notes = [*self.notes]
         if self._unfit:
             if values.size == 0 and self.why_unfit:
                 raise SelectionError(

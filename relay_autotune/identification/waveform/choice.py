@@ -230,16 +230,16 @@ def ahead_of_command(problem: Problem, state: Trial) -> float:
     """
     if state.theta[-1] >= problem.shortest:
         return 0.0
-    earlier = _AHEAD * problem.shortest
-    earlier = float(unit_steps(problem.structure, state.theta, earlier)[-1])
+    least = _AHEAD * problem.shortest
+    earlier = float(unit_steps(problem.structure, state.theta, least)[-1])
     inputs = tuple(replace(u, times=u.times - earlier) for u in problem.inputs)
     moved = replace(problem, inputs=inputs, structure=FOPDT, colour=None)
-    n, floor = problem.time.size, problem.time.size * NEGLIGIBLE**2
+    context = FitContext.of(moved, 0, held=True)
 
     def score(of: Trial) -> float:
-        return information_criterion(of.cost, n, of.parameters, floor)
+        return information_criterion(of.cost, problem.time.size, of.parameters, context.floor)
 
-    for c in FitContext.of(moved, 0, held=True).fit(PLAIN):
+    for c in context.fit(PLAIN):
         own = refine(replace(c.problem, colour=problem.colour), c.state.theta, tolerance=TRIAL)
         by = earlier - float(own.theta[-1])
         if by > _ROWS * problem.shortest and score(state) - score(own) > _ANSWERED:
