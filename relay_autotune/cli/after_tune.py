@@ -50,6 +50,7 @@ from relay_autotune.exchange.export import (
     exports_of,
 )
 from relay_autotune.exchange.messages import (
+    how_ended,
     reason_from_message,
     transfer_function_from_message,
 )
@@ -65,7 +66,7 @@ if TYPE_CHECKING:
 # Relative difference of gains that are the same.
 _NEAR = 1e-6
 _UNFINISHED = "the proof did not end"
-_FAILED = "the step that was to prove them failed: {}"
+_FAILED = "the step that was to prove them {}"
 
 
 @dataclass(frozen=True)
@@ -393,7 +394,8 @@ class AfterTune(Tuned):
         elif doubt:
             raise TuningError(f"doubtful gains are not proven unasked: {doubt}")
         found = self._made(proof, step)
-        return found.passed, "" if found.passed else found.reason
+        passed = found.verdict == found.PASSED
+        return passed, "" if passed else how_ended(found)
 
     def _made(self, proof: Proof, step: float) -> Any:
         """Make the step, and show what it has found."""

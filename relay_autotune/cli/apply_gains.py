@@ -43,6 +43,7 @@ from relay_autotune.cli.terminal import (
 from relay_autotune.errors import LoopError, TuningError
 from relay_autotune.exchange.messages import (
     gains_from_message,
+    how_ended,
     reason_from_message,
     why_doubtful,
 )
@@ -58,8 +59,6 @@ PROGRAM = "apply_gains"
 # What a verification has found: names and texts.
 Entries = tuple[tuple[str, str], ...]
 
-# With any other reason, a proof that did not pass has ended without a verdict.
-_FAILURES = (Code.NOT_AS_PREDICTED, Code.STEP_RAN_AWAY, Code.STEP_OUT_OF_RANGE)
 # An uncertainty of the overshoot that is worth showing, as a fraction of the step.
 _SEEN = 0.03
 # How long a verification waits until the loop is at rest [s].
@@ -191,7 +190,8 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
 
     :param client: of the controller_node, which was found.
     :param options: as the command line gives them.
-    :return: whether the gains are in force, and why their step failed; empty: it did not.
+    :return: whether the gains are in force, and how their proof has ended; empty: it passed, or
+        was not made.
     """
     with Working("asking for the gains"):
         present, (model, _) = client.in_force(), client.identified()
@@ -235,7 +235,8 @@ def apply_and_verify(client: GainsClient, options: argparse.Namespace) -> tuple[
         shown.clear()
         for entry in entries:
             tell(*entry)
-    return result.passed, "" if result.passed else result.reason
+    passed = result.verdict == result.PASSED
+    return passed, "" if passed else how_ended(result)
 
 
 def verified(
@@ -262,13 +263,14 @@ def verified(
     """
     before = client.in_force()
     result = client.prove(step, load, patience, tell, leave, new)
+    passed = result.verdict == result.PASSED
     try:
         now = _numbers(client.in_force())
-        if result.passed and stays:
+        if passed and stays:
             with suppress(LoopError):
                 client.ask("before")
                 now += f"; {PROGRAM} --revert takes those before"
-        if not result.passed and new is not None and client.has(gains_from_message(new)):
+        if not passed and new is not None and client.has(gains_from_message(new)):
             now += "; these are the new ones, which are not proven: set those before yourself"
     except LoopError as error:
         now = f"not known: {error}; before the proof: {_numbers(before)}"
@@ -299,13 +301,13 @@ def found_entries(result: Any) -> Entries:
     """
     from relay_autotune.control.verification import SETTLED
 
-    failed = reason_from_message(result.why).code in _FAILURES
-    told = f"{'failed' if failed else 'none'}: {result.reason}"
-    if result.passed:
-        told = "passed: the loop does what the model predicts"
+    passed = result.verdict == result.PASSED
+    told = "passed: the loop does what the model predicts"
+    if not passed:
+        told = f"{'failed' if result.verdict == result.FAILED else 'none'}: {result.reason}"
     whys = [reason_from_message(step.why) for step in result.steps]
     narrow = [str(why["narrow"]) for why in whys if why.code is Code.NARROWLY]
-    if narrow and result.passed:
+    if narrow and passed:
         told = f"passed, narrowly: {'; '.join(narrow)}"
     found = [("verdict", told)]
     for step, why in zip(result.steps, whys, strict=True):

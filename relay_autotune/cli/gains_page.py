@@ -19,6 +19,7 @@ from relay_autotune.errors import LoopError, RelayAutotuneError, TuningError
 from relay_autotune.exchange.messages import (
     fill_gains,
     gains_from_message,
+    how_ended,
     why_doubtful,
 )
 from relay_autotune.loop.gains import Controller
@@ -234,8 +235,8 @@ class GainsPage:
             # In place of the proof before; one that was cut short has no steps.
             live.show("proof", [_document(each) for each in shown])
         live.rest(
-            f"{what} {'passed' if result.passed else 'failed'}: {result.reason}{left}",
-            good=result.passed,
+            f"{what} {how_ended(result)}{left}",
+            good=result.verdict == result.PASSED,
             # The proof before stays where this one was cut short.
             proof=entries if result.steps else live.told.proof,
         )

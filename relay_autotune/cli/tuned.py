@@ -260,7 +260,7 @@ class Proof:
             tell(f"starting {CONTROLLER}")
             controller.find(START_WITHIN, leave)
             found = controller.prove(step, 0.0, patience, tell, leave, self._message)
-            if found.passed:
+            if found.verdict == found.PASSED:
                 # Without gains it would hold its command, wherever that is.
                 controller.let_settle(self._choice.settles, tell, "the loop goes back", leave)
             steps = controller.steps_of(found)

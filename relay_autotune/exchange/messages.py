@@ -426,6 +426,15 @@ def why_doubtful(message: Any) -> str:
     return message.verdict_reason or "no verdict was given"
 
 
+def how_ended(message: Any) -> str:
+    """Return how a proof of gains has ended, and why, in words.
+
+    :param message: the `Verify.Result`.
+    """
+    known = {message.PASSED: "passed", message.FAILED: "failed"}
+    return f"{known.get(message.verdict, 'ended without a verdict')}: {message.reason}"
+
+
 def made_visible(message: Any) -> Any:
     """Return a message of another node, in whose texts nothing acts on a terminal or a log.
 

@@ -168,7 +168,7 @@ class ControllerNode(ServedNode):
             prepare=self._prepare_verification,
             begin=lambda tried: self._keeper.begin_verification(tried.new),
             move=self._move,
-            ended=self._after_verification,
+            ended=lambda passed: self._keeper.end_verification(passed),
         )
         self._remote: RemoteLoop | None = None
         self._place: Place = OwnGains(self._use, self._rate)
@@ -544,12 +544,6 @@ class ControllerNode(ServedNode):
         if self._remote is not None:
             self._remote.move(setpoint)
         self._offset, self._load = setpoint, load
-
-    async def _after_verification(self, passed: bool | None, reason: str) -> str:
-        reason += await self._keeper.end_verification(passed)
-        verdict = "ended without a verdict" if passed is None else "passed" if passed else "failed"
-        self.get_logger().info(f"verification {verdict}: {reason}")
-        return reason
 
     # The end.
 

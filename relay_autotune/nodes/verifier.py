@@ -21,7 +21,12 @@ from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import SETTLES, Plan, compare, plan
 from relay_autotune.errors import NotReadyError, RelayAutotuneError
 from relay_autotune.exchange.fields import float64_array
-from relay_autotune.exchange.messages import fill_reason, reason_from_message, set_stamp
+from relay_autotune.exchange.messages import (
+    fill_reason,
+    how_ended,
+    reason_from_message,
+    set_stamp,
+)
 from relay_autotune.experiment.settling import rest_state, slow_movement
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
@@ -186,7 +191,7 @@ class Verifier:
         cannot. Nothing has changed before, and whatever comes after, `ended` is called.
     :param move: adds a step to the set-point [y] and one to the command [u]; 0: no step.
     :param ended: called with True if all steps passed, False if one failed, None without a
-        verdict, and a sentence; returns the sentence for the client.
+        verdict; returns what became of the gains, for the sentence of the result.
     """
 
     def __init__(
@@ -196,7 +201,7 @@ class Verifier:
         prepare: Callable[[Any], Awaitable[Verifiable]],
         begin: Callable[[Verifiable], Awaitable[None]],
         move: Callable[[float, float], None],
-        ended: Callable[[bool | None, str], Awaitable[str]],
+        ended: Callable[[bool | None], Awaitable[str]],
     ) -> None:
         self._node = node
         self._verifiable, self._on_trial, self._move, self._ended = prepare, begin, move, ended
@@ -243,7 +248,7 @@ class Verifier:
         elif not 0.0 <= patience <= LONGEST_TIME:
             why = other(f"patience is {patience:g} s, expected 0 to {LONGEST_TIME:g} s")
         if why:
-            conclude(goal, _result(False, why, str(why)), succeeded=False)
+            conclude(goal, _result(None, why, str(why)), succeeded=False)
             return
         self._goal, self._over, self._found = goal, None, []
         self._waits_for, self._is_settling = "", False
@@ -262,14 +267,14 @@ class Verifier:
             self._end(None, _why(error))
         assert self._over is not None
         passed, why = self._over
-        reason = str(why)
         try:
-            reason = await self._ended(passed, reason)
+            became = await self._ended(passed)
         except Exception as error:  # noqa: BLE001
-            reason = f"{reason}; {_why(error)}"
+            became = f"; {_why(error)}"
         self._watch.cancel()
         self._goal = None
-        result = _result(passed is True, why, reason, self._found)
+        result = _result(passed, why, f"{why}{became}", self._found)
+        self._node.get_logger().info(f"verification {how_ended(result)}")
         conclude(goal, result, succeeded=succeeded)
 
     async def _course(self, request: Any) -> tuple[bool | None, Reason]:
@@ -592,14 +597,15 @@ def _why(error: Exception) -> Reason:
     return other(f"{type(error).__name__}: {error}")
 
 
-def _result(passed: bool, why: Reason, reason: str, steps: Sequence[Any] = ()) -> Any:
+def _result(passed: bool | None, why: Reason, reason: str, steps: Sequence[Any] = ()) -> Any:
     """Return the result for the client.
 
-    :param passed: whether all steps passed.
+    :param passed: whether all steps passed; None: there is no verdict.
     :param why: the reason.
     :param reason: the sentence, with what became of the gains.
     :param steps: those that were made, without arrays.
     """
-    result = Verify.Result(passed=passed, reason=reason, steps=list(steps))
+    kinds = {None: Verify.Result.NONE, True: Verify.Result.PASSED, False: Verify.Result.FAILED}
+    result = Verify.Result(verdict=kinds[passed], reason=reason, steps=list(steps))
     fill_reason(result.why, why)
     return result

@@ -124,7 +124,9 @@ def test_a_slip_in_the_present_gains_is_asked_about(typed: Controller, meant: st
 
 def test_a_verdict_has_five_lines() -> None:
     load = step(kind=Verification.LOAD, step=0.3, gain_ratio=1.01)
-    result = Verify.Result(passed=True, reason="long numbers", steps=[step(), load])
+    result = Verify.Result(
+        verdict=Verify.Result.PASSED, reason="long numbers", steps=[step(), load]
+    )
     asked: list[str] = []
     present = Controller(0.6, 0.75, 0.2, 0.02)
     lines = laid_out(verdict_entries(result, present, lambda s: asked.append(s) or "kc 0.3"), 120)
@@ -145,7 +147,9 @@ def test_in_noise_a_proof_says_how_far_it_moves_the_overshoot_and_widens_the_ban
     wide = Code.AS_PREDICTED(numbers="numbers").plus(settled_band=0.11)
     for each in (noisy, load):
         fill_reason(each.why, wide)
-    result = Verify.Result(passed=True, reason="long", steps=[noisy, load, step()])
+    result = Verify.Result(
+        verdict=Verify.Result.PASSED, reason="long", steps=[noisy, load, step()]
+    )
     found = dict(enumerate(text for _, text in found_entries(result)))
     told = (
         "overshoot 10 +- 6 % (predicted 11 %), settled within 11 % after 3.8 s (predicted 4.2 s)"
@@ -158,7 +162,7 @@ def test_in_noise_a_proof_says_how_far_it_moves_the_overshoot_and_widens_the_ban
 def test_the_gain_of_the_process_has_its_uncertainty_where_the_noise_is_known() -> None:
     noisy = step(gain_ratio=1.04)
     fill_reason(noisy.why, Code.AS_PREDICTED(numbers="numbers").plus(gain_uncertainty=0.062))
-    result = Verify.Result(passed=True, reason="long", steps=[step(), noisy])
+    result = Verify.Result(verdict=Verify.Result.PASSED, reason="long", steps=[step(), noisy])
     lines = laid_out(found_entries(result), 120)
     assert "gain 0.96 and 1.04 +- 0.06 times the model's" in lines[3]
 
@@ -167,7 +171,7 @@ def test_what_passed_close_to_a_limit_is_called_narrow() -> None:
     close = step()
     narrow = "the gain is 0.66 times the model's, 0.6 to 1.7 passes"
     fill_reason(close.why, Code.NARROWLY(narrow=narrow, numbers="numbers"))
-    result = Verify.Result(passed=True, reason="long", steps=[step(), close])
+    result = Verify.Result(verdict=Verify.Result.PASSED, reason="long", steps=[step(), close])
     first = laid_out(verdict_entries(result, None), 99)[0]
     assert first.split(maxsplit=1)[1] == (
         "passed, narrowly: the gain is 0.66 times the model's, 0.6 to 1.7 passes"
@@ -175,7 +179,9 @@ def test_what_passed_close_to_a_limit_is_called_narrow() -> None:
 
 
 def test_a_verdict_that_failed_says_why_and_which_gains_are_back() -> None:
-    failed = Verify.Result(passed=False, reason="it settles later; kc 0.1 in force again")
+    failed = Verify.Result(
+        verdict=Verify.Result.FAILED, reason="it settles later; kc 0.1 in force again"
+    )
     fill_reason(failed.why, Code.NOT_AS_PREDICTED(problems="it settles later", numbers="numbers"))
     text = "\n".join(laid_out(verdict_entries(failed, Controller(0.1, 3.0)), 60))
     assert "failed: it settles later" in text
@@ -185,7 +191,7 @@ def test_a_verdict_that_failed_says_why_and_which_gains_are_back() -> None:
 
 def test_a_proof_that_is_cut_short_is_not_said_to_have_failed() -> None:
     why = Code.INTERFERED(sentence="the set-point was changed to 43 by another node")
-    ended = Verify.Result(passed=False, reason=str(why))
+    ended = Verify.Result(reason=str(why))
     fill_reason(ended.why, why)
     assert found_entries(ended) == (("verdict", f"none: {why}"),)
 
@@ -312,10 +318,10 @@ def test_a_proof_says_what_happens_if_it_fails_and_then_holds_no_command(
         "there: /valve goes to 2 u."
     )
     did: list[str] = []
-    for passed in (False, True):
+    for verdict in (Verify.Result.FAILED, Verify.Result.PASSED):
         node = SimpleNamespace(
             find=lambda *_: None, steps_of=lambda _: [],
-            prove=lambda *_, passed=passed: did.append("proof") or Verify.Result(passed=passed),
+            prove=lambda *_, v=verdict: did.append("proof") or Verify.Result(verdict=v),
             let_settle=lambda *_: did.append("settles"),
         )  # fmt: skip
         monkeypatch.setattr(proof, "_started", lambda _, node=node: nullcontext(node))
@@ -386,16 +392,17 @@ def test_what_a_node_allows_is_raised_until_the_end_of_a_block() -> None:
 def test_new_gains_that_could_not_be_taken_back_are_told_as_such(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    failed = Verify.Result(passed=False, reason="no measurement for 2 s")
+    ended = Verify.Result(reason="no measurement for 2 s")
+    told_of_it = False, "ended without a verdict: no measurement for 2 s"
     given = apply_gains._parser().parse_args(["--yes", "--step", "0.5"])
     present: list[Any] = [Controller(0.1, 3.0)]
-    client = client_of(lambda *words: present.append(GAINS) or failed, lambda: present[-1])
-    assert apply_gains.apply_and_verify(client, given) == (False, failed.reason)
+    client = client_of(lambda *words: present.append(GAINS) or ended, lambda: present[-1])
+    assert apply_gains.apply_and_verify(client, given) == told_of_it
     told = " ".join(capsys.readouterr().out.split("gains in force")[-1].split())
     assert "these are the new ones, which are not proven" in told
     present[:] = [Controller(0.1, 3.0)]
-    client = client_of(lambda *words: present.append(None) or failed, lambda: gone(present))
-    assert apply_gains.apply_and_verify(client, given) == (False, failed.reason)
+    client = client_of(lambda *words: present.append(None) or ended, lambda: gone(present))
+    assert apply_gains.apply_and_verify(client, given) == told_of_it
     told = " ".join(capsys.readouterr().out.split())
     assert "gains in force not known: it is gone; before the proof: kc 0.1000, ti 3.000" in told
 
@@ -439,9 +446,12 @@ def test_the_page_refuses_a_step_beyond_the_limits_before_anything_changes() -> 
     controller.has = lambda gains: True
     assert page.plan(PageCommand(PROVE, dry=3)).refusal == "these gains are in force already"
     # what takes them back is a button of the page, not another command
-    controller.prove = lambda *words: Verify.Result(passed=True, steps=[step()])
+    controller.prove = lambda *words: Verify.Result(verdict=Verify.Result.PASSED, steps=[step()])
     page.do(PageCommand(VERIFY, step=1.0))
     assert live.told.proof[-1] == ("gains in force", "kc 0.1000, ti 3.000, td 0")
+    controller.prove = lambda *words: Verify.Result(reason="a tune has begun")
+    page.do(PageCommand(VERIFY, step=1.0))
+    assert live.told.status == "verification ended without a verdict: a tune has begun"
 
 
 def test_a_command_line_that_does_not_fit_ends_with_two() -> None:

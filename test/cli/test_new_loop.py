@@ -981,7 +981,7 @@ def test_a_file_that_needs_limits_is_written_from_the_recording(
 def test_gains_that_failed_are_not_recommended_and_their_file_says_so(
     shown: Callable[..., str], tmp_path: Path
 ) -> None:
-    failed = shown(False, "it runs away", "failed.yaml")
+    failed = shown(False, "failed: it runs away", "failed.yaml")
     assert "the command stands at 35 u" in failed and "start your own" not in failed
     assert f"controller_node: {tmp_path / 'failed.yaml'}" in failed
     assert failed.endswith("NEXT")
@@ -1014,9 +1014,9 @@ def test_gains_that_failed_at_a_joint_are_exported_with_that_or_not_at_all(
     shown: Callable[..., str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     file = tmp_path / "gains.yaml"
-    shown(False, "it runs away", bag="tune", export=str(file), at_joint=True)
+    shown(False, "failed: it runs away", bag="tune", export=str(file), at_joint=True)
     assert not file.exists()
-    shown(False, "it runs away", export=str(file), accept_doubtful=True, at_joint=True)
+    shown(False, "failed: it runs away", export=str(file), accept_doubtful=True, at_joint=True)
     first = file.read_text().splitlines()[0]
     assert first == "# DOUBTFUL: the step that was to prove them failed: it runs away"
     file.unlink()
@@ -1034,7 +1034,7 @@ def test_a_program_that_is_named_gets_gains_of_its_own_and_a_start_without_a_bum
     assert float(values["KP"]) * float(values["X0"]) == pytest.approx(35.0)
     (period,) = re.findall(r"Designed for iec_61131_3_pid every ([\d.]+) s", text)
     assert f"--law iec_61131_3_pid --sample-period {period} --verify" in told
-    other = shown(False, "it runs away", "px4_rate", "0.1", "px4.txt")
+    other = shown(False, "failed: it runs away", "px4_rate", "0.1", "px4.txt")
     told = "# DOUBTFUL: the step that was to prove them failed: it runs away"
     assert told in (tmp_path / "px4.txt").read_text()
     assert other.endswith("NEXT")

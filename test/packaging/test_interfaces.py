@@ -89,7 +89,7 @@ PROMISED = {
     "action/Verify.action": """
         float64 setpoint_step load_step
         ---
-        bool passed
+        uint8 verdict
         string reason
         Verification[] steps
         ---
@@ -203,6 +203,7 @@ def test_interfaces_are_generated():
     [
         ("msg/RelayExperiment.msg", {"UNKNOWN": 0, "COMPLETED": 1, "ABORTED": 2, "FAILED": 3}),
         ("action/Tune.action", {"UNKNOWN": 0, "COMPLETED": 1, "ABORTED": 2, "FAILED": 3}),
+        ("action/Verify.action", {"NONE": 0, "PASSED": 1, "FAILED": 2}),
     ],
 )
 def test_outcomes_keep_their_numbers(file: str, values: dict[str, int]):

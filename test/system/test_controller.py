@@ -265,7 +265,7 @@ def test_gains_that_do_not_do_what_was_predicted_go_back(rig: Rig) -> None:
     rig.until(lambda: len(commands) > 400, "a closed loop")
     status, result = verify(rig)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
-    assert not result.passed
+    assert result.verdict == result.FAILED
     assert "kc 0.3, ti 0.8 s, td 0 s in force again" in result.reason
     assert parameters_of(rig) == [0.3, 0.8]
     # Only one earlier set exists, so there is one revert at most.
@@ -298,7 +298,7 @@ def test_gains_for_another_law_are_proven_by_a_node_that_runs_it(rig: Rig) -> No
     rig.until(lambda: len(commands) > 400, "a closed loop")
     status, result = verify(rig)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
-    assert result.passed, result.reason
+    assert result.verdict == result.PASSED, result.reason
     # The law takes the derivative of the error, so that a step of the set-point jumps through it,
     # and it runs at every fifth sample: most of its commands stand for five of them. On a busy
     # machine, which loses samples or delays them, some stand for other numbers.

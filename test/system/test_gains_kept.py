@@ -16,6 +16,7 @@ from made_experiments import experiment_of
 from std_msgs.msg import Float64
 
 from relay_autotune.process.transfer_function import TransferFunction as Process
+from relay_autotune_msgs.action import Verify
 
 GOOD, WILD = (0.5, 0.6), (0.9, 0.3)
 
@@ -44,7 +45,7 @@ def test_failed_gains_stay_nowhere_and_never_come_back(rig: Rig) -> None:
     assert loop.gains_shown()[0] == 0.0
     assert "revert" not in loop.apply(*WILD, "wild", gain=0.7).message
     result = loop.verify(setpoint_step=0.3)
-    assert not result.passed
+    assert result.verdict == result.FAILED
     # The first gains ever: there are no earlier ones.
     assert "the command is held" in result.reason
     assert loop.gains_shown()[0] == 0.0
@@ -63,7 +64,7 @@ def test_failed_gains_stay_nowhere_and_never_come_back(rig: Rig) -> None:
     # Other gains are accepted; their failure does not restore the first failed set.
     loop.offer(0.8, 0.3, "second", gain=0.7)
     rig.until(lambda: loop.gains_shown() == (0.8, 0.3), "auto_apply")
-    assert not loop.verify(setpoint_step=0.3).passed
+    assert loop.verify(setpoint_step=0.3).verdict == Verify.Result.FAILED
     assert loop.gains_shown()[0] == 0.0
     assert not loop.trigger("revert").success
 
@@ -73,7 +74,7 @@ def test_after_a_kill_the_proven_gains_are_in_force(rig: Rig, moment: str) -> No
     loop = HandLoop(rig, kc=0.3, ti=1.0)
     loop.apply(*GOOD, "good")
     result = loop.verify(setpoint_step=0.3)
-    assert result.passed, result.reason
+    assert result.verdict == result.PASSED, result.reason
     loop.apply(*WILD, "wild")
 
     def kill() -> None:
@@ -182,7 +183,7 @@ def test_verify_is_bounded_and_ends_without_a_verdict_where_time_is_wrong(rig: R
         (1e6, "time went on by 1e+06 s"),
     ):
         result = loop.verify(lambda later=later: loop.step(later=later), setpoint_step=0.3)
-        assert not result.passed
+        assert result.verdict == result.NONE
         assert reason in result.reason
         # Unproven gains go back, and wait to be tried again.
         assert "kc 0.3, ti 1 s, td 0 s in force again" in result.reason
@@ -190,7 +191,7 @@ def test_verify_is_bounded_and_ends_without_a_verdict_where_time_is_wrong(rig: R
         assert loop.trigger("apply").success
     # Before the step as well.
     result = loop.verify(setpoint_step=0.3)
-    assert result.passed, result.reason
+    assert result.verdict == result.PASSED, result.reason
 
 
 def test_a_set_point_of_the_operator_is_no_failure_of_the_gains(rig: Rig) -> None:
@@ -204,14 +205,14 @@ def test_a_set_point_of_the_operator_is_no_failure_of_the_gains(rig: Rig) -> Non
         loop.step()
 
     # A set-point equal to the present one changes nothing.
-    assert loop.verify(same, setpoint_step=0.3).passed
+    assert loop.verify(same, setpoint_step=0.3).verdict == Verify.Result.PASSED
 
     def other() -> None:
         setpoints.publish(Float64(data=5.6))
         loop.step()
 
     result = loop.verify(other, setpoint_step=0.3)
-    assert not result.passed
+    assert result.verdict == result.NONE
     assert "the set-point was changed to 5.6" in result.reason
     # They were proven before.
     assert loop.gains_shown() == GOOD
@@ -225,11 +226,11 @@ def test_a_step_that_the_noise_hides_changes_nothing(rig: Rig) -> None:
     loop.apply(*GOOD, "good")
     for step in (1e-9, 0.001):
         result = loop.verify(setpoint_step=step)
-        assert not result.passed
+        assert result.verdict == result.NONE
         assert "y cannot be judged" in result.reason
         assert loop.gains_shown() == GOOD
     # It was not on trial, so that it did not fail.
-    assert loop.verify(setpoint_step=0.3).passed
+    assert loop.verify(setpoint_step=0.3).verdict == Verify.Result.PASSED
 
 
 def test_gains_are_put_in_force_and_proven_in_one_go_or_not_at_all(rig: Rig) -> None:
@@ -244,7 +245,7 @@ def test_gains_are_put_in_force_and_proven_in_one_go_or_not_at_all(rig: Rig) -> 
     assert "y cannot be judged; kc 0.3" in result.reason
     assert loop.gains_shown() == (0.3, 1.0)
     result = loop.verify(setpoint_step=0.3, apply=True, patience=60.0)
-    assert result.passed, result.reason
+    assert result.verdict == result.PASSED, result.reason
     assert loop.gains_shown() == GOOD
     # Who has reverted may think better of it, and none before are lost.
     assert loop.trigger("revert").success
@@ -252,7 +253,9 @@ def test_gains_are_put_in_force_and_proven_in_one_go_or_not_at_all(rig: Rig) -> 
     for _ in range(2):
         assert loop.trigger("apply").success
         assert loop.gains_shown() == GOOD
-    assert loop.verify(setpoint_step=0.3, apply=True, patience=60.0).passed
+    assert (
+        loop.verify(setpoint_step=0.3, apply=True, patience=60.0).verdict == Verify.Result.PASSED
+    )
     assert loop.trigger("before").message == "kc 0.3, ti 1 s, td 0 s"
     assert loop.trigger("discard").success
     assert "no gains wait" in loop.verify(setpoint_step=0.3, apply=True).reason
@@ -289,7 +292,7 @@ def test_a_change_that_cannot_be_stored_is_refused(rig: Rig) -> None:
 def test_gains_beyond_new_limits_do_not_come_back_after_a_restart(rig: Rig) -> None:
     loop = HandLoop(rig, kc=0.3, ti=1.0)
     loop.apply(*GOOD, "good")
-    assert loop.verify(setpoint_step=0.3).passed
+    assert loop.verify(setpoint_step=0.3).verdict == Verify.Result.PASSED
     loop.node.signal(signal.SIGTERM)
     loop.node.wait()
     loop.start(kc_max=0.4)

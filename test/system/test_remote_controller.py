@@ -29,7 +29,7 @@ def test_the_gains_of_another_node_are_proved_or_taken_back(rig: Rig) -> None:
 
     status, result = loop.verify(setpoint_step=0.5)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
-    assert result.passed, result.reason
+    assert result.verdict == result.PASSED, result.reason
     (step,) = result.steps
     # Its samples are on the topic.
     assert not (step.time or step.measurement or step.command or step.predicted)
@@ -41,7 +41,7 @@ def test_the_gains_of_another_node_are_proved_or_taken_back(rig: Rig) -> None:
     rig.run_for(2.0)
     other = [m.data for m in loop.setpoints]
     status, result = loop.verify(lambda: setpoint.publish(Float64(data=4.8)), setpoint_step=0.5)
-    assert not result.passed
+    assert result.verdict == result.NONE
     assert "another node set the set-point to 4.8" in result.reason
     rig.run_for(2.0)
     loop.until_setpoints(*other, 5.5, 4.8)
@@ -51,7 +51,7 @@ def test_the_gains_of_another_node_are_proved_or_taken_back(rig: Rig) -> None:
     loop.apply(0.8, 2.6, 0.6)
     status, result = loop.verify(setpoint_step=0.5)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
-    assert not result.passed
+    assert result.verdict == result.FAILED
     assert "/pid_controller has gains.heater.d 0, gains.heater.i 1.6" in result.reason
     assert loop.values() == [0.5, 1.6, 0.0]
     loop.until_setpoints(*other, 5.5, 4.8, 5.3, 4.8)
@@ -62,14 +62,14 @@ def test_the_gains_of_a_joint_are_proved_by_the_state_of_its_controller(rig: Rig
     loop.apply(0.5, 1.6, 2.0)
     status, result = loop.verify(setpoint_step=0.5)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
-    assert result.passed, result.reason
+    assert result.verdict == result.PASSED, result.reason
     (step,) = result.steps
     assert step.gain_ratio == pytest.approx(1.0, abs=0.2)
     # Gains for a process with a third of the true gain.
     loop.apply(0.8, 2.6, 0.6)
     status, result = loop.verify(setpoint_step=0.5)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.reason
-    assert not result.passed
+    assert result.verdict == result.FAILED
     assert loop.values() == [0.5, 1.6, 0.0]
     loop.until_setpoints(5.5, 5.0, 5.5, 5.0)
     # The other joint of the message stays where it was.

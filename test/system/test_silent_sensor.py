@@ -131,7 +131,7 @@ def test_gains_are_proven_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None
     rig.until(answer.done, "the result")
     client.destroy()
     result = answer.result().result
-    assert result.passed, result.reason
+    assert result.verdict == result.PASSED, result.reason
     (step,) = rig.until(lambda: steps, "the samples of the step")
     assert step.gain_ratio == pytest.approx(1.0, abs=0.2)
     # No gap, although the sensor is silent once the loop has settled.

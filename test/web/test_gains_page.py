@@ -138,7 +138,7 @@ def test_a_proof_is_in_the_report_of_its_gains_and_is_computed_once(monkeypatch)
 
         def made(self, step, doubtful, tell, leave):
             asked.append(step)
-            result = Verify.Result(passed=True, reason="numbers", steps=[made])
+            result = Verify.Result(verdict=Verify.Result.PASSED, reason="numbers", steps=[made])
             return result, (("gains", "kc 0.5"), *found_entries(result)), []
 
     monkeypatch.setattr(gains_page, "Proof", Made)
