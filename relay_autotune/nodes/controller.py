@@ -169,6 +169,7 @@ class ControllerNode(ServedNode):
             begin=lambda tried: self._keeper.begin_verification(tried.new),
             move=self._move,
             ended=lambda passed: self._keeper.end_verification(passed),
+            silent=self._why_silent,
         )
         self._remote: RemoteLoop | None = None
         self._place: Place = OwnGains(self._use, self._rate)
@@ -191,7 +192,9 @@ class ControllerNode(ServedNode):
         if self._remote is None:
             self.create_subscription(Float64, "setpoint", self._on_setpoint, quality.COMMAND)
         if self._reported is None:
-            self.create_subscription(Float64, "command", self._on_command, quality.COMMAND)
+            self.create_subscription(
+                Float64, "command", lambda m: self._hear(m.data), quality.COMMAND
+            )
         for kind, topic, take in (
             (Bool, "hold_request", self._on_hold),
             (RelayExperiment, "relay_experiment", self._on_experiment),
@@ -262,7 +265,7 @@ class ControllerNode(ServedNode):
         if self._reported is not None and self._remote is not None:
             # It answers this measurement; the one before was in force until now.
             try:
-                self._remote.hear_command(self._reported(message))
+                self._hear(self._reported(message))
             except FieldError as error:
                 self.get_logger().error(
                     f"the command of {self._place.name} cannot be read: {error}",
@@ -291,8 +294,6 @@ class ControllerNode(ServedNode):
             self._setpoint = value
         if self._remote is not None:
             command = self._remote.command
-            if self._verifier.is_running and (reason := self._remote.why_silent()):
-                self._verifier.interrupt(reason)
         else:
             if self._is_untaken():
                 # An integral that went on would be a jump for whoever takes the commands later.
@@ -342,15 +343,29 @@ class ControllerNode(ServedNode):
             self._verifier.interrupt(Code.INTERFERED(sentence=why))
         self._setpoint = value
 
-    def _on_command(self, message: Float64) -> None:
+    def _hear(self, command: float) -> None:
+        """Take a command on its way to the actuator [u], of whoever commands it."""
+        if not is_usable(command):
+            return
+        if not self._held:
+            self._verifier.hear_command()
         if self._remote is not None:
-            self._remote.hear_command(message.data)
+            self._remote.command = command
         elif self._held or self._untaken:
-            self._pid.track(message.data)
+            self._pid.track(command)
+
+    def _why_silent(self, silence: float) -> Reason:
+        """Return what it means that no command has come for a time [s]."""
+        if self._remote is not None:
+            return Code.SILENT_OWNER(node=self._place.name, silence=silence)
+        topic = self.resolve_topic_name("command")
+        why = f"no command on {topic} for {silence:.3g} s: what passes them on has stopped"
+        return Code.INTERFERED(sentence=why)
 
     def _on_hold(self, message: Bool) -> None:
         self._held = message.data
         if self._held:
+            self._verifier.commands.forget()
             self._verifier.interrupt(Code.INTERFERED(sentence="a tune has begun"))
 
     def _switch(self, request: SetBool.Request) -> str:
@@ -493,6 +508,8 @@ class ControllerNode(ServedNode):
             raise NotReadyError(Code.NOBODY_SUBSCRIBES(topic=self._commands.topic_name))
         if self._remote is not None:
             self._remote.require_ready()
+        if why := self._verifier.why_silent():
+            raise NotReadyError(why)
         new, settles = None, math.nan
         if request.apply:
             _, gains = self._acceptable()

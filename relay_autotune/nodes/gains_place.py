@@ -9,7 +9,6 @@ Another node has them as parameters; its set-point is a topic.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -324,9 +323,6 @@ another node may have changed them, else None; ``put`` applies gains, all or non
 tells which are in force. All but the last raise RelayAutotuneError.
 """
 
-# A controller without a command for this time counts as silent [s].
-_SILENCE = 2.0
-
 
 def setpoint_message(values: Mapping[str, Any]) -> CommandMessage:
     """Return what writes a set-point into the message that its receiver takes.
@@ -368,8 +364,6 @@ class RemoteLoop:
         self.command = math.nan
         """The last command received [u]; NaN before the first."""
         self._target = target
-        # Silence before the first command counts from here.
-        self._heard_at = time.monotonic()
         self.setpoint = setpoint
         """The set-point in force [y]; NaN: not known."""
         self._setpoints = setpoints
@@ -379,19 +373,6 @@ class RemoteLoop:
         self._on_the_way: list[float] = []
         self._publisher = quality.publisher(node, setpoints.kind, "setpoint", quality.COMMAND)
         quality.subscription(node, setpoints.kind, "setpoint", self._on_setpoint, quality.COMMAND)
-
-    def hear_command(self, command: float) -> None:
-        """Take a command of the other node [u]."""
-        if is_usable(command):
-            self.command = command
-            self._heard_at = time.monotonic()
-
-    def why_silent(self) -> Reason | None:
-        """Return a reason if the other node has stopped sending commands."""
-        silent = time.monotonic() - self._heard_at
-        if silent < _SILENCE:
-            return None
-        return Code.SILENT_OWNER(node=self._target, silence=silent)
 
     def require_ready(self) -> None:
         """Refuse a loop in which the effect of a set-point step could not be seen.
@@ -409,8 +390,6 @@ class RemoteLoop:
             raise NotReadyError(Code.NOBODY_TAKES(topic=topic, node=target))
         if math.isnan(self.command):
             raise NotReadyError(Code.NOT_HEARD(node=target))
-        if reason := self.why_silent():
-            raise NotReadyError(reason)
 
     def move(self, offset: float) -> None:
         """Put a step on the set-point [y]; 0: none."""

@@ -33,6 +33,7 @@ from relay_autotune.nodes import quality
 from relay_autotune.nodes.goals import Narrator, conclude, serve_goals
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.nodes.results import keep
+from relay_autotune.nodes.watch import LEAST_SILENCE, SILENT_INTERVALS
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import NONE, Code, Reason, other, reason_of
 from relay_autotune.text import duration
@@ -46,7 +47,8 @@ _LEAST_BEFORE = 10
 _STILL = 0.1
 # Slow noise moves the mean of a few samples by this many standard deviations at most.
 _SLOW_NOISE = 4.0
-# Longest silence of the measurement: a time [s], or a number of usual intervals if that is longer.
+# Longest silence of measurement and commands: a time [s], or a number of usual intervals if that
+# is longer.
 _SILENCE = 2.0
 _SILENT_INTERVALS = 20.0
 _LOOK_EVERY = 0.2
@@ -175,6 +177,70 @@ class Trial:
         return bool(self.samples) and self.lasted >= self.plan.duration
 
 
+class CommandWatch:
+    """Hear whether samples are answered by commands on the topic that the actuator takes.
+
+    Only where commands have come before can they fall silent: else they go another way.
+    """
+
+    def __init__(self) -> None:
+        self._heard: deque[float] = deque(maxlen=_BEFORE)
+        # When the first sample came that waits for a command; NaN: none does.
+        self._waits_since = math.nan
+        self._longest = 0.0
+
+    def begin(self) -> None:
+        """Begin a proof."""
+        self._longest = 0.0
+
+    def sample(self) -> None:
+        """Take note of a sample, which a command is to answer."""
+        if math.isnan(self._waits_since):
+            self._waits_since = time.monotonic()
+
+    def hear(self) -> None:
+        """Take note of a command."""
+        self._longest = max(self._longest, self._silence)
+        if self.too_long():
+            self._heard.clear()
+        self._heard.append(time.monotonic())
+        self._waits_since = math.nan
+
+    def forget(self) -> None:
+        """Forget the commands, since others come while a tune runs."""
+        self._heard.clear()
+
+    def too_long(self) -> float:
+        """Return for how long no command has come, where that ends a proof [s]; else 0."""
+        silence = self._silence
+        return silence if silence > _longest_silence(self._heard) else 0.0
+
+    def unsure(self) -> float | None:
+        """Return the longest silence in a proof [s] that leaves it unsure why it failed; else 0.
+
+        None: not known yet, since the last sample still waits for its command.
+        """
+        few = _longest_silence(self._heard, LEAST_SILENCE, SILENT_INTERVALS)
+        if 0.0 < self._silence <= few:
+            return None
+        longest = max(self._longest, self._silence)
+        return longest if longest > few else 0.0
+
+    @property
+    def _silence(self) -> float:
+        waits = len(self._heard) > 1 and not math.isnan(self._waits_since)
+        return time.monotonic() - self._waits_since if waits else 0.0
+
+
+def _longest_silence(
+    arrivals: deque[float], least: float = _SILENCE, intervals: float = _SILENT_INTERVALS
+) -> float:
+    """Return how long messages may stay away that came at these times [s]."""
+    if len(arrivals) < 2:
+        return least
+    return max(least, intervals * (arrivals[-1] - arrivals[0]) / (len(arrivals) - 1))
+
+
 class _EndedError(Exception):
     """The proof has ended before its course did."""
 
@@ -192,6 +258,7 @@ class Verifier:
     :param move: adds a step to the set-point [y] and one to the command [u]; 0: no step.
     :param ended: called with True if all steps passed, False if one failed, None without a
         verdict; returns what became of the gains, for the sentence of the result.
+    :param silent: returns the reason where no command has come for a time [s].
     """
 
     def __init__(
@@ -202,8 +269,11 @@ class Verifier:
         begin: Callable[[Verifiable], Awaitable[None]],
         move: Callable[[float, float], None],
         ended: Callable[[bool | None], Awaitable[str]],
+        silent: Callable[[float], Reason],
     ) -> None:
-        self._node = node
+        self._node, self._silent = node, silent
+        self.commands = CommandWatch()
+        """What it hears of the commands."""
         self._verifiable, self._on_trial, self._move, self._ended = prepare, begin, move, ended
         # Verdict and reason, once the proof has ended.
         self._over: tuple[bool | None, Reason] | None = None
@@ -252,6 +322,7 @@ class Verifier:
             return
         self._goal, self._over, self._found = goal, None, []
         self._waits_for, self._is_settling = "", False
+        self.commands.begin()
         self._until = time.monotonic() + _PREPARED_WITHIN + patience
         self._watch.reset()
         self._node.defer(self._narrator.now)
@@ -267,6 +338,12 @@ class Verifier:
             self._end(None, _why(error))
         assert self._over is not None
         passed, why = self._over
+        if passed is False:
+            # Samples that no command has answered say nothing of the gains.
+            while (silence := self.commands.unsure()) is None:
+                await self._next()
+            if silence:
+                passed, why = None, self._silent(silence)
         try:
             became = await self._ended(passed)
         except Exception as error:  # noqa: BLE001
@@ -346,9 +423,12 @@ class Verifier:
 
     async def _woken(self) -> None:
         """Wait until something may have come; raise _EndedError if the proof has ended."""
+        await self._next()
+        self._require_on()
+
+    async def _next(self) -> None:
         self._wake = Future()
         await self._wake
-        self._require_on()
 
     def _wake_up(self) -> None:
         if not self._wake.done():
@@ -458,6 +538,7 @@ class Verifier:
         sample = (at, measurement, command)
         self._recent.append(sample)
         self._arrivals.append(now)
+        self.commands.sample()
         if (trial := self._trial) is None:
             self._beyond = 0
         elif since < 0.0:
@@ -477,6 +558,17 @@ class Verifier:
                     self._wake_up()
             elif trial.is_over:
                 self._wake_up()
+
+    def hear_command(self) -> None:
+        """Take note of a command on its way to the actuator."""
+        self.commands.hear()
+        if self._over is not None:
+            self._wake_up()
+
+    def why_silent(self) -> Reason | None:
+        """Return a reason if the commands have stopped."""
+        silence = self.commands.too_long()
+        return self._silent(silence) if silence else None
 
     def out_of_range(self, measurement: float) -> None:
         """Take a measurement outside its range [y], which the controller did not answer."""
@@ -527,11 +619,13 @@ class Verifier:
         if now > self._until:
             self.interrupt(Code.STEP_OVERTIME())
             return
+        if why := self.why_silent():
+            self.interrupt(why)
+            return
         arrivals = self._arrivals
         if (self._trial is None and not self._is_settling) or not arrivals:
             return
-        usual = (arrivals[-1] - arrivals[0]) / max(len(arrivals) - 1, 1)
-        patience = max(_SILENCE, _SILENT_INTERVALS * usual)
+        patience = _longest_silence(arrivals)
         if now - arrivals[-1] > patience:
             self.interrupt(Code.STEP_SILENT(silence=now - arrivals[-1]))
         elif now - self._advanced > patience:

@@ -6,9 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from types import SimpleNamespace
 from typing import Any
-from unittest.mock import MagicMock
 
 import pytest
 import rclpy
@@ -21,9 +19,8 @@ from relay_autotune.bag.definitions import FLOAT64
 from relay_autotune.cli.own_nodes import free_domain
 from relay_autotune.errors import ParameterError
 from relay_autotune.exchange.messages import set_stamp
-from relay_autotune.nodes import gains_place, quality
+from relay_autotune.nodes import quality
 from relay_autotune.nodes.controller import ControllerNode
-from relay_autotune.nodes.gains_place import RemoteLoop
 from relay_autotune.nodes.live_types import reader_of
 from relay_autotune.nodes.watch import Repeater, require_own_time
 from relay_autotune.reasons import Code
@@ -181,16 +178,3 @@ def test_a_number_of_samples_is_no_clock_of_what_is_repeated() -> None:
     require_own_time(0.1, 0.0)
     with pytest.raises(ParameterError, match=r"repeat_period and sample_period 0.1 s are both"):
         require_own_time(0.1, 0.2)
-
-
-def test_a_controller_that_was_never_heard_is_silent_since_its_loop_is_looked_at(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The steady clock begins with the machine, not with the proof."""
-    now = 6310.0
-    monkeypatch.setattr(gains_place, "time", SimpleNamespace(monotonic=lambda: now))
-    monkeypatch.setattr(gains_place, "quality", MagicMock())
-    loop = RemoteLoop(MagicMock(), "/pid", 1.0, MagicMock(), MagicMock())
-    assert loop.why_silent() is None
-    now += 3.0
-    assert str(loop.why_silent()) == "no command of /pid for 3 s"
