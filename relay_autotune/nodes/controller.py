@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Awaitable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -157,6 +157,8 @@ class ControllerNode(ServedNode):
         self._held = False
         # True while nobody subscribes to the commands.
         self._untaken = True
+        # False once a sensor that is silent at times has gone.
+        self._alive = True
         # Steps that a verification adds to set-point and command.
         self._offset = self._load = 0.0
         # True while this node writes its gains into its own parameters.
@@ -203,11 +205,11 @@ class ControllerNode(ServedNode):
         ):
             self.create_subscription(kind, topic, take, quality.RESULT)
         # The loop must keep running while these services wait for the disk or another node.
-        waiting = ReentrantCallbackGroup()
-        serve(self, Trigger, "~/apply", lambda _: self._apply(), callback_group=waiting)
+        waiting = {"callback_group": ReentrantCallbackGroup()}
+        serve(self, Trigger, "~/apply", lambda _: self._told(self._apply()), **waiting)
         serve(self, Trigger, "~/discard", self._discard)
         serve(self, Trigger, "~/before", lambda _: self._keeper.before())
-        serve(self, Trigger, "~/revert", lambda _: self._keeper.revert(), callback_group=waiting)
+        serve(self, Trigger, "~/revert", lambda _: self._told(self._keeper.revert()), **waiting)
         serve(self, SetBool, "~/automatic", self._switch)
         ask_before_changes(self, self._require_settable)
         self.add_post_set_parameters_callback(self._after_set)
@@ -251,6 +253,7 @@ class ControllerNode(ServedNode):
             value = math.nan
         if self._repeater is not None:
             self._repeater.hear(value)
+            self._is_alive(None)
         if self._period > 0.0:
             at = self._count * self._period
             self._count += 1
@@ -276,8 +279,19 @@ class ControllerNode(ServedNode):
         """Take the last measurement again: a silent sensor means that it has not changed."""
         assert self._repeater is not None
         # A dead sensor must not be repeated: the integral would run away on an old value.
-        if not self._repeater.why_dead():
+        if self._is_alive(self._repeater.why_dead()):
             self._take(self.get_clock().now().nanoseconds * 1e-9 - ago, value)
+
+    def _is_alive(self, why_dead: Reason | None) -> bool:
+        """Tell whether a sensor that is silent at times is alive, and log where that changes."""
+        alive = why_dead is None
+        if alive is not self._alive:
+            self._alive = alive
+            if alive:
+                self.get_logger().info("the sensor is back")
+            else:
+                self.get_logger().warning(f"{why_dead}: the command is held")
+        return alive
 
     def _take(self, at: float, value: float) -> None:
         if self._ending:
@@ -363,19 +377,26 @@ class ControllerNode(ServedNode):
         return Code.INTERFERED(sentence=why)
 
     def _on_hold(self, message: Bool) -> None:
-        self._held = message.data
+        if message.data is self._held:
+            return
+        self._held, why = message.data, "a tune has begun"
         if self._held:
             self._verifier.commands.forget()
-            self._verifier.interrupt(Code.INTERFERED(sentence="a tune has begun"))
+            self._verifier.interrupt(Code.INTERFERED(sentence=why))
+        self.get_logger().info(why if self._held else "the tune has ended")
 
     def _switch(self, request: SetBool.Request) -> str:
         if not request.data:
             why = "the controller was switched to manual"
             self._verifier.interrupt(Code.INTERFERED(sentence=why))
+        before = self._pid.is_automatic
         self._pid.switch(automatic=request.data)
         if self._pid.is_automatic != request.data:
             raise TuningError("there are no gains yet: the command is held")
-        return "automatic" if request.data else f"manual: {self._pid.command:g} is held"
+        now = "automatic" if request.data else f"manual: {self._pid.command:g} is held"
+        if before != request.data:
+            self.get_logger().info(now)
+        return now
 
     # Gains.
 
@@ -433,9 +454,15 @@ class ControllerNode(ServedNode):
             self._tried = self._newest
             self.executor.create_task(self._apply_and_tell)
 
+    async def _told(self, change: Awaitable[str]) -> str:
+        """Return the sentence on a change of the gains, which the log has, too."""
+        said = await change
+        self.get_logger().info(said)
+        return said
+
     async def _apply_and_tell(self) -> None:
         try:
-            self.get_logger().info(await self._apply())
+            await self._told(self._apply())
         except RelayAutotuneError as error:
             self.get_logger().error(str(error))
 

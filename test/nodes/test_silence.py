@@ -137,7 +137,7 @@ def test_with_simulated_time_a_silence_is_as_long_as_that_clock_says(
 
 
 def test_the_controller_integrates_while_the_sensor_stands_by_its_value(
-    simulated: Callable[..., Simulated],
+    simulated: Callable[..., Simulated], capfd: pytest.CaptureFixture[str]
 ) -> None:
     loop = simulated(
         ControllerNode,
@@ -171,6 +171,12 @@ def test_the_controller_integrates_while_the_sensor_stands_by_its_value(
     for k in range(6, 9):
         loop.at(10.5 + 0.5 * k)
     assert len(commands) == 5
+    loop.sensor = loop.world.create_publisher(Float64, "measurement", quality.RESULT)
+    loop.sensor.publish(Float64(data=2.0))
+    loop.until(lambda: len(commands) > 5)
+    said = capfd.readouterr().err
+    assert said.count("its publisher has left: the command is held") == 1
+    assert said.count("the sensor is back") == 1
 
 
 def test_a_number_of_samples_is_no_clock_of_what_is_repeated() -> None:

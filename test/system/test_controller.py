@@ -106,6 +106,8 @@ def test_a_loop_is_tuned_through_its_controller_and_proves_the_gains(rig: Rig) -
     before = len(commands)
     rig.until(lambda: len(commands) > before + 200, "the controller's commands")
     assert max(abs(m.data - 1.0) for m in commands[before:]) < 0.25
+    for change in ("a tune has begun", "the tune has ended"):
+        assert controller.log.count(change) == 1
     # Gains are applied only on request.
     assert "wait: kc" in controller.log
     process = subprocess.Popen(

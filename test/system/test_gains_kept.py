@@ -32,6 +32,7 @@ def test_revert_leads_to_the_last_whole_set_or_is_refused(rig: Rig) -> None:
     assert loop.set(ti=3.0).successful
     assert loop.trigger("before").message == "kc 0.3, ti 1 s, td 0 s"
     assert loop.trigger("revert").success
+    assert loop.node.log.count("kc 0.3, ti 1 s, td 0 s in force again") == 1
     assert loop.gains_shown() == (0.3, 1.0)
     assert "~/revert brings back those before" in loop.apply(*GOOD, "one").message
     assert loop.trigger("revert").success
@@ -240,7 +241,9 @@ def test_gains_are_put_in_force_and_proven_in_one_go_or_not_at_all(rig: Rig) -> 
     result = loop.verify(lambda: loop.set_automatic(False), setpoint_step=0.3, apply=True)
     assert "switched to manual; kc 0.3, ti 1 s, td 0 s in force again" in result.reason
     assert loop.gains_shown() == (0.3, 1.0)
-    loop.set_automatic(True)
+    for _ in range(2):
+        loop.set_automatic(True)
+    assert loop.node.log.count("]: automatic\n") == loop.node.log.count("]: manual: ") == 1
     result = loop.verify(setpoint_step=1e-9, apply=True, patience=60.0)
     assert "y cannot be judged; kc 0.3" in result.reason
     assert loop.gains_shown() == (0.3, 1.0)
