@@ -27,8 +27,8 @@ from relay_autotune.reasons import Code
 # Number of earlier sets, and of failed and of doubtful sets, that are kept.
 KEPT = 20
 KNOWN = 1000
-# Numbers with a smaller relative difference are equal.
-_EQUAL = 1e-9
+# Numbers with a smaller relative difference are equal; and are the same as people are shown them.
+_EQUAL, _SHOWN = 1e-9, 1e-3
 
 
 class HistoryError(TuningError):
@@ -84,11 +84,11 @@ class GainSet:
         """Return the numbers by their names."""
         return dict(self.values)
 
-    def is_near(self, other: GainSet) -> bool:
-        """Return True if another set has the same numbers within rounding."""
+    def is_near(self, other: GainSet, within: float = _EQUAL) -> bool:
+        """Return True if another set has the same numbers within a relative difference."""
         theirs = other.by_name()
         return theirs.keys() == self.by_name().keys() and all(
-            math.isclose(value, theirs[name], rel_tol=_EQUAL) for name, value in self.values
+            math.isclose(value, theirs[name], rel_tol=within) for name, value in self.values
         )
 
     def is_mixture(self, one: GainSet, other: GainSet) -> bool:
@@ -154,6 +154,10 @@ class GainsHistory:
         """The gains in force; None: the command is held."""
         return self.in_force.gains if self.in_force else None
 
+    def has_failed(self, gains: GainSet) -> bool:
+        """Return True if gains failed a verification, also as someone typed them from a log."""
+        return any(gains.is_near(failed, _SHOWN) for failed in self.failed)
+
     # New gains.
 
     def require_not_failed(self, gains: GainSet) -> None:
@@ -161,7 +165,7 @@ class GainsHistory:
 
         :raises HistoryError: if they did.
         """
-        if gains in self.failed:
+        if self.has_failed(gains):
             raise HistoryError(f"these gains failed their verification: {gains}; tune again")
 
     def apply(self, gains: GainSet) -> GainsHistory:
@@ -244,7 +248,7 @@ class GainsHistory:
         gains = self.in_force.gains
         state = replace(
             self,
-            before=tuple(entry for entry in self.before if entry.gains != gains),
+            before=tuple(e for e in self.before if not e.gains.is_near(gains, _SHOWN)),
             failed=(*(g for g in self.failed if g != gains), gains)[-KNOWN:],
         )
         return state._back().settled()
@@ -266,7 +270,7 @@ class GainsHistory:
 
     def is_open_to(self, gains: GainSet) -> bool:
         """Return True if gains may be applied automatically."""
-        return gains not in self.failed and gains not in self.doubtful
+        return not self.has_failed(gains) and gains not in self.doubtful
 
     # After a restart.
 
@@ -276,10 +280,9 @@ class GainsHistory:
         :param allows: tells whether gains may be in force.
         :param present: True: also without those in force.
         """
-        failed = frozenset(self.failed)
 
         def fits(entry: Entry) -> bool:
-            return entry.gains not in failed and allows(entry.gains)
+            return not self.has_failed(entry.gains) and allows(entry.gains)
 
         stays = self.in_force is not None and (not present or fits(self.in_force))
         return replace(
@@ -300,7 +303,7 @@ class GainsHistory:
         state = replace(state, given=given)
         if given is None:
             return state._with(None)
-        return state if given in self.failed else state._with(Entry(given, Standing.GIVEN))
+        return state if self.has_failed(given) else state._with(Entry(given, Standing.GIVEN))
 
     # Helpers.
 
@@ -316,7 +319,7 @@ class GainsHistory:
         edited = entry is not None and entry.standing is Standing.EDITED
         half = old is not None and old.standing is Standing.EDITED and (edited or entry is None)
         before = self.before
-        if old is not None and not half and old.gains not in self.failed:
+        if old is not None and not half and not self.has_failed(old.gains):
             before = (*before, old.whole())
         if len(before) > KEPT:
             # Drop the oldest, but keep the newest trusted set.
@@ -332,7 +335,7 @@ class GainsHistory:
     def _trusted(self) -> GainsHistory:
         """Put the newest trusted set in force."""
         chain = (*self.before, *((self.in_force,) if self.in_force else ()))
-        return self._newest(chain, lambda e: e.is_trusted and e.gains not in self.failed)
+        return self._newest(chain, lambda e: e.is_trusted and not self.has_failed(e.gains))
 
     def _newest(self, chain: tuple[Entry, ...], fits: Callable[[Entry], bool]) -> GainsHistory:
         """Put the newest fitting set of a chain in force, or none, and forget those after it."""

@@ -64,6 +64,20 @@ def test_the_first_gains_ever_do_not_stay_after_a_fail():
         history.revert()
 
 
+def test_failed_gains_do_not_come_back_by_the_digits_that_are_shown():
+    """Each number that is set by hand makes a whole set, and the last one completes those."""
+    failed = gains(0.53612837, 12.345678)
+    told, other = gains(0.5361, 12.35), gains(0.5361, 20.0)
+    history = applied(applied(GainsHistory.begun(G), told), failed).verify().fail()
+    assert history.gains == G
+    history = history.edit(other)
+    for event in (history.edit, history.apply, history.verify):
+        with pytest.raises(HistoryError, match="failed their verification"):
+            event(told)
+    assert not history.is_open_to(told) and history.is_open_to(gains(0.54, 12.35))
+    assert history.after_restart(told).gains == G
+
+
 def test_a_second_fail_does_not_bring_the_first_failed_set_back():
     history = applied(GainsHistory.begun(G), A).verify().fail()
     assert history.gains == G

@@ -56,6 +56,9 @@ def test_failed_gains_stay_nowhere_and_never_come_back(rig: Rig) -> None:
     by_hand = loop.set(kc=WILD[0], ti=WILD[1])
     assert not by_hand.successful
     assert "failed their verification" in by_hand.reason
+    # Nor do they come one by one, rounded.
+    assert loop.set(ti=WILD[1]).successful
+    assert "failed their verification" in loop.set(kc=0.9001).reason
     # The latched topic offers them to each node that starts.
     loop.node.signal(signal.SIGTERM)
     assert loop.node.wait() == 0
