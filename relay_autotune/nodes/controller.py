@@ -640,7 +640,27 @@ class ControllerNode(ServedNode):
         values = merged(self, (*tables.GAINS, *tables.OTHERS), changes)
         gains = tables.settings_from(values, self._rate).gains
         if self._remote is None and {change.name for change in changes} & NAMES_OF_GAINS:
+            odd = self._why_odd(gains)
             self._keeper.edit(self._own(gains))
+            if odd:
+                self.get_logger().warning(odd)
+
+    def _why_odd(self, gains: Controller | None) -> str:
+        """Return why the sign of gains that are set by hand looks wrong; "" if it does not.
+
+        :raises TuningError: if the newest trusted model says that the loop would run away.
+        """
+        models = reversed(self._results.models.values())
+        model = next((model for model, doubt in models if not doubt), None)
+        present = self._pid.gains
+        sign = model.process_sign if model else present.kc if present else 0.0
+        if gains is None or gains.kc * sign >= 0.0:
+            return ""
+        others = "the process by its model" if model else "the gains in force"
+        why = f"kc is {gains.kc:g}, of the other sign than {others}: the loop"
+        if model and not is_stable(self._place.control(gains).law, model):
+            raise TuningError(f"{why} would run away; tune again, or give it at the node's start")
+        return f"{why} may run away"
 
     def _after_set(self, changes: list[Parameter]) -> None:
         if self._following:

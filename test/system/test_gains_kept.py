@@ -73,6 +73,22 @@ def test_failed_gains_stay_nowhere_and_never_come_back(rig: Rig) -> None:
     assert not loop.trigger("revert").success
 
 
+def test_a_kc_of_the_wrong_sign_is_not_taken_without_a_word(rig: Rig) -> None:
+    loop = HandLoop(rig, kc=0.3, ti=1.0)
+    assert loop.set(kc=-0.2).successful
+    said = "of the other sign than the gains in force: the loop may run away"
+    assert loop.node.log.count(said) == 1
+    # Setting it right is no cause for a warning.
+    loop.offer(*GOOD, "good")
+    assert loop.set(kc=0.2).successful
+    refused = loop.set(kc=-0.2)
+    assert "of the other sign than the process by its model" in refused.reason
+    assert loop.gains_shown() == (0.2, 1.0)
+    # Without integral action it is stable.
+    assert loop.set(kc=-0.2, ti=0.0).successful
+    assert loop.node.log.count("kc is -0.2, of the other sign") == 2
+
+
 @pytest.mark.parametrize("moment", ["applied", "verifying"])
 def test_after_a_kill_the_proven_gains_are_in_force(rig: Rig, moment: str) -> None:
     loop = HandLoop(rig, kc=0.3, ti=1.0)
