@@ -152,7 +152,7 @@ def analyse(
         simple = chosen.simple(known, rules)
     tell("judging the model")
     record = chosen.record
-    found = Analysis(record, assess(models, record), 0)
+    found = Analysis(record, assess(models, record))
     settled = bool(found.cycles) and limit_cycle(found.cycles).converged
     return _judged(found, (record,), task, rules, simple, rng, tell, settled=settled)
 
@@ -236,7 +236,7 @@ class _Chosen:
     @property
     def alone(self) -> Analysis:
         """The analysis with this model only."""
-        return Analysis(self.record, (self.model,), 0)
+        return Analysis(self.record, (self.model,))
 
     def fopdt(self, known: Known) -> Identification | None:
         """Return the best FOPDT by the default method; None: there is none.
@@ -343,7 +343,7 @@ def analyse_jointly(
     told = unequal_amplitudes(records, chosen.model)
     if told:
         chosen = replace(chosen, warnings=(*chosen.warnings, told))
-    found = Analysis(first, assess((chosen,), first), 0)
+    found = Analysis(first, assess((chosen,), first))
     rules = _first(rule)
     return _judged(found, records, task, rules, joint.simple(known, rules), rng)
 
@@ -398,7 +398,7 @@ def _judged(
 
 def _without_gains(found: Analysis, judgement: Judgement) -> Analysis:
     reason = judgement.refused or f"no gains: {judgement.reason}"
-    return replace(found, gains=(), recommended=None, judgement=judgement, reason=reason)
+    return replace(found, gains=(), judgement=judgement, reason=reason)
 
 
 def _first(rule: str) -> tuple[str, ...]:
@@ -418,7 +418,7 @@ def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
         with suppress(TuningError):
             gains.append(design(task, name))
     delay = task.options.added_delay
-    return replace(found, gains=tuple(gains), recommended=0, added_delay=delay)
+    return replace(found, gains=tuple(gains), added_delay=delay)
 
 
 def _guarded(method: str, fit: Callable[[], Identification]) -> Identification:

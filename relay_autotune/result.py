@@ -92,9 +92,7 @@ class Analysis:
 
     :param record: the record.
     :param models: the models of all methods that apply, the chosen method's first.
-    :param selected: index of the selected model; None: nothing was identified.
-    :param gains: the gains of all rules that apply to that model, the chosen rule's first.
-    :param recommended: index of the recommended gains; None: there are no gains.
+    :param gains: the gains of all rules that apply to the first model, the chosen rule's first.
     :param reason: why there is no model or no gains; empty if there are both.
     :param added_delay: dead time beside the process's own with which the gains were judged [s]:
         half a sampling period of the controller, and what else its loop adds.
@@ -106,9 +104,7 @@ class Analysis:
 
     record: Record
     models: tuple[Identification, ...] = ()
-    selected: int | None = None
     gains: tuple[Gains, ...] = ()
-    recommended: int | None = None
     reason: str = ""
     added_delay: float = 0.0
     judgement: Judgement = NOT_JUDGED
@@ -122,13 +118,13 @@ class Analysis:
 
     @property
     def model(self) -> Identification | None:
-        """The selected identification."""
-        return None if self.selected is None else self.models[self.selected]
+        """The selected identification; None: nothing was identified."""
+        return self.models[0] if self.models else None
 
     @property
     def best_gains(self) -> Gains | None:
-        """The recommended gains."""
-        return None if self.recommended is None else self.gains[self.recommended]
+        """The recommended gains; None: there are no gains."""
+        return self.gains[0] if self.gains else None
 
     @property
     def verdict(self) -> Verdict:

@@ -331,12 +331,11 @@ def _known_all_the_same(found: Identification) -> list[_Entry]:
 
 def _others(analysis: Analysis) -> list[_Entry]:
     """Return what the other methods found, a line for each."""
-    others = [model for i, model in enumerate(analysis.models) if i != analysis.selected]
     texts, instead = [], ""
     chosen = None if analysis.model is None else analysis.model.validation
     if chosen is not None and not chosen.reason:
         instead = f" instead of {digits(100.0 * chosen.worst, 2)} %"
-    for m in others:
+    for m in analysis.models[1:]:
         note = f"{m.structure}, {m.method}"
         if m.validation is not None and not m.validation.reason:
             note += f", limit cycle {digits(100.0 * m.validation.worst, 2)} % off{instead}"
@@ -382,8 +381,8 @@ def _validation(validation: Validation) -> str:
 
 def _other_gains(analysis: Analysis) -> list[_Entry]:
     """Return what the other rules say, a line for each."""
-    others = [gains for i, gains in enumerate(analysis.gains) if i != analysis.recommended]
-    return _listed("also", [f"{_three(g)}   Ms {digits(g.ms, 3)}   ({g.rule})" for g in others])
+    others = (f"{_three(g)}   Ms {digits(g.ms, 3)}   ({g.rule})" for g in analysis.gains[1:])
+    return _listed("also", list(others))
 
 
 def _gains(gains: Gains, verdict: Verdict, series: Sequence[str]) -> list[_Entry]:

@@ -381,12 +381,13 @@ class _Designs:
         """Return the model as a page shows it."""
         from relay_autotune.report.case import Case, given_model
 
+        given = given_model(self.task.model)
         return Case(
             source=process_text(self.task.model),
-            models=(given_model(self.task.model),),
-            selected=0,
+            models=(given,),
+            model=given,
             gains=tuple(self.gains),
-            recommended=self.recommended,
+            best_gains=None if self.recommended is None else self.gains[0],
             added_delay=self.task.options.added_delay,
         )
 

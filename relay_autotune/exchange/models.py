@@ -259,9 +259,9 @@ def _experiment(analysis: Analysis) -> dict[str, Any]:
         "relay": None if settings is None else to_document(settings),
         "limit_cycle": _limit_cycle(analysis),
         "models": [to_document(model) for model in analysis.models],
-        "selected": analysis.selected,
+        "selected": 0 if analysis.models else None,
         "gains": [to_document(gains) for gains in analysis.gains],
-        "recommended": analysis.recommended,
+        "recommended": 0 if analysis.gains else None,
         "added_delay": json_number(analysis.added_delay),
         **judgement_fields(analysis.judgement),
     }

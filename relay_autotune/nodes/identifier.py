@@ -160,15 +160,14 @@ class IdentifierNode(ServedNode):
             )
         response.success = found.model is not None
         _answered(response, other(found.reason))
-        # Only the selected model was judged.
+        # Only the selected model was judged, and the recommended gains: the first ones.
         for number, identification in enumerate(found.models):
-            judgement = found.judgement if number == found.selected else None
+            judgement = None if number else found.judgement
             response.models.append(_model_message(record, identification, judgement))
         for number, gains in enumerate(found.gains):
-            judgement = found.judgement if number == found.recommended else None
+            judgement = None if number else found.judgement
             response.gains.append(_gains_message(record, gains, judgement))
-        response.selected = found.selected or 0
-        response.recommended = found.recommended or 0
+        response.selected = response.recommended = 0
         return response
 
     # One fit at a time.

@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -34,6 +34,8 @@ from relay_autotune.result import Analysis
 from relay_autotune.text import is_unit, visible
 from relay_autotune.tuning.ensemble import ensemble
 from relay_autotune.verdict import NOT_JUDGED, Judgement
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -74,9 +76,9 @@ class Case:
     :param outcome: how it ended.
     :param reason: why it ended so, or why there is no model or no gains.
     :param models: what each method found.
-    :param selected: index of the selected model; None: nothing was identified.
+    :param model: the selected one of them; None: nothing was identified.
     :param gains: what each rule gives.
-    :param recommended: index of the recommended gains; None: there are none.
+    :param best_gains: the recommended ones of them; None: there are none.
     :param limit_cycle: averages over its cycles; None: no whole cycle.
     :param samples: number of samples; 0: not known.
     :param lost_samples: number of samples that were sent and not received.
@@ -99,9 +101,9 @@ class Case:
     outcome: Outcome = Outcome.UNKNOWN
     reason: str = ""
     models: tuple[Identification, ...] = ()
-    selected: int | None = None
+    model: Identification | None = None
     gains: tuple[Gains, ...] = ()
-    recommended: int | None = None
+    best_gains: Gains | None = None
     limit_cycle: LimitCycle | None = None
     samples: int = 0
     lost_samples: int = 0
@@ -122,11 +124,6 @@ class Case:
         return () if self.record is None else cycles_of(self.record)
 
     @property
-    def model(self) -> Identification | None:
-        """The selected model."""
-        return None if self.selected is None else self.models[self.selected]
-
-    @property
     def points(self) -> tuple[FrequencyPoint, ...]:
         """Points of the frequency response, by Fourier integrals over the cycles."""
         return next((m.points for m in self.models if m.points), ())
@@ -140,11 +137,6 @@ class Case:
     def ultimate(self) -> tuple[EstimatedQuantity, ...]:
         """K_u and w_u of the selected model, empty where it has none."""
         return () if self.model is None else ultimate_of(self.model, self.truth)
-
-    @property
-    def best_gains(self) -> Gains | None:
-        """The recommended gains."""
-        return None if self.recommended is None else self.gains[self.recommended]
 
 
 def in_loop(case: Case, model: TransferFunction) -> TransferFunction:
@@ -175,9 +167,9 @@ def case_of(analysis: Analysis, source: str, *, truth: TransferFunction | None =
         reason=analysis.reason or record.reason,
         models=analysis.models,
         truth=truth,
-        selected=analysis.selected,
+        model=analysis.model,
         gains=analysis.gains,
-        recommended=analysis.recommended,
+        best_gains=analysis.best_gains,
         limit_cycle=limit_cycle(analysis.cycles) if analysis.cycles else None,
         samples=len(record),
         lost_samples=record.lost_samples,
@@ -351,7 +343,7 @@ def _case(e: dict[str, Any], source: str, truth: TransferFunction | None) -> Cas
     cycle = e["limit_cycle"]
     models = tuple(of_document(Identification, m) for m in e["models"])
     gains = tuple(of_document(Gains, g) for g in e["gains"])
-    selected = _index(e["selected"], models)
+    model = _chosen(e["selected"], models)
     return Case(
         source=source,
         experiment_id=str(e["experiment_id"]),
@@ -361,24 +353,26 @@ def _case(e: dict[str, Any], source: str, truth: TransferFunction | None) -> Cas
         reason=str(e["reason"]),
         models=models,
         truth=truth,
-        selected=selected,
+        model=model,
         gains=gains,
-        recommended=_index(e["recommended"], gains),
+        best_gains=_chosen(e["recommended"], gains),
         limit_cycle=None if cycle is None else _limit_cycle(cycle),
         samples=int(e["samples"]),
         lost_samples=int(e["lost_samples"]),
         settings=None if e["relay"] is None else of_document(RelaySettings, e["relay"]),
-        models_around=around(None if selected is None else models[selected]),
+        models_around=around(model),
         added_delay=number(e.get("added_delay", 0.0)),
         judgement=judgement_of_fields(e),
         units={n: str(u) for n, u in e.get("units", {}).items() if is_unit(str(u))},
     )
 
 
-def _index(value: Any, things: Sequence[object]) -> int | None:
-    if value is not None and not 0 <= int(value) < len(things):
-        raise ValueError(f"index {value} of {len(things)}")
-    return None if value is None else int(value)
+def _chosen(index: Any, things: Sequence[_T]) -> _T | None:
+    if index is None:
+        return None
+    if not 0 <= int(index) < len(things):
+        raise ValueError(f"index {index} of {len(things)}")
+    return things[int(index)]
 
 
 def _limit_cycle(c: dict[str, Any]) -> LimitCycle:

@@ -282,7 +282,7 @@ class PageModel:
         return replace(
             self.case,
             gains=(shaped.gains, *others),
-            recommended=0,
+            best_gains=shaped.gains,
             judgement=shaped.judgement,
             reason="",
             added_delay=shaped.options.added_delay,

@@ -84,7 +84,7 @@ def test_a_failed_check_is_named_beside_the_verdict():
         replace(f, result=Result.FAILED) if f is worst else f for f in found.judgement.findings
     ]
     judgement = replace(found.judgement, findings=tuple(failed))
-    text = table("tank", [replace(found, judgement=judgement, gains=(), recommended=None)])
+    text = table("tank", [replace(found, judgement=judgement, gains=())])
     count = len(failed)
     said = f"none, {count - 1} of {count} checks passed; failed: {worst.title.lower()}"
     assert said in " ".join(text.split())
@@ -129,7 +129,7 @@ def test_gains_are_shown_in_the_series_form_where_they_have_one():
         (1.6, "kc 1.600 u/y ti 8.000 s td 2.000 s"),
         (3.0, "none: ti = 10 s is less"),
     ):
-        shown = replace(found, gains=(replace(best, td=td),), recommended=0)
+        shown = replace(found, gains=(replace(best, td=td),))
         assert f"series form {told}" in " ".join(table("tank", [shown], form="series").split())
     assert "series form" not in table("tank", [found])
 

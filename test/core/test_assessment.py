@@ -96,7 +96,7 @@ def test_a_model_without_limit_cycle_says_so(record, models):
 
 
 def test_json_table_and_message_carry_all_of_it(record, models):
-    analysis = Analysis(record, models=tuple(models), selected=0)
+    analysis = Analysis(record, models=tuple(models))
     shown = json.loads(to_json(document("x", [analysis])))["experiments"][0]["models"]
     for model, fields in zip(models, shown, strict=True):
         for name in (f.name for f in result_fields(Validation)):

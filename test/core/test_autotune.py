@@ -116,7 +116,7 @@ def test_data_that_tell_nothing_are_a_reason():
     record = _record()
     constant = replace(record, measurement=np.full(len(record), 5.0))
     found = analyse(constant)
-    assert found.selected is None
+    assert found.model is None
     assert found.gains == ()
     assert "constant" in found.reason
 

@@ -38,7 +38,7 @@ def test_model_and_gains_stand_in_a_table() -> None:
     covariance = np.diag([1e-4, 1e-2, 1e-3])
     estimate = Estimate.of(FOPDT, np.array([1.65, 20.0, 10.0]), covariance)
     found = identified("waveform", estimate)
-    shown = cells(Analysis(RECORD, (found,), 0, (GAINS,), 0))
+    shown = cells(Analysis(RECORD, (found,), (GAINS,)))
     assert shown["process"] == "1.650e−10.00s(1+20.00s) fopdt, waveform"  # noqa: RUF001
     assert shown["K_u"].startswith("2.307 u/y ± ")
     assert shown["ISA form"].startswith("kc 0.6700 u/y, ti 21.10 s")
@@ -55,7 +55,7 @@ def test_an_interpreter_shows_ten_lines_at_most() -> None:
     covariance = np.diag([1e-4, 1e-2, 1e-3])
     estimate = Estimate.of(FOPDT, np.array([1.65, 20.0, 10.0]), covariance)
     found = identified("waveform", estimate, warnings=("the sensor drifts",))
-    shown = repr(Analysis(RECORD, (found,) * 9, 0, (GAINS,) * 16, 0, reason="look at it"))
+    shown = repr(Analysis(RECORD, (found,) * 9, (GAINS,) * 16, reason="look at it"))
     assert len(shown.splitlines()) <= 10
     assert max(map(len, shown.splitlines())) < 100
     for told in ("2 samples over 1 s", "1.650 e^(-10.00 s)", "kc 0.6700 u/y", "look at it"):

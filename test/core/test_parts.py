@@ -64,5 +64,5 @@ def test_of_parts_that_contradict_each_other_none_is_trusted(first, gain, verdic
 
 @pytest.mark.long
 def test_a_part_without_gains_contradicts_none(first):
-    refused = replace(part(-1.65, 2), gains=(), recommended=None)
+    refused = replace(part(-1.65, 2), gains=())
     assert agreed((first, refused)) == (first, refused)

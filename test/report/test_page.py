@@ -232,7 +232,7 @@ def test_a_document_gives_the_same_report_without_what_needs_samples(monkeypatch
         assert (ours.rule, ours.reason, ours.form) == (theirs.rule, theirs.reason, theirs.form)
         for name in ("kc", "ti", "td", "tf", "b", "ms", "ms_95", "gain_margin", "iae_load"):
             assert getattr(ours, name) == getattr(theirs, name)
-    assert case.recommended == direct.recommended == 0
+    assert case.best_gains is case.gains[0]
     assert case.model.model == direct.model.model
     for ours, theirs in zip(case.parameters, direct.parameters, strict=True):
         assert (ours.name, ours.unit, ours.low) == (theirs.name, theirs.unit, theirs.low)
@@ -311,7 +311,7 @@ def test_the_models_within_the_uncertainty_are_those_of_the_document(build, para
         identified("waveform", Estimate.of_root(structure, values, root)),
         rivals=(Rival(Estimate.of(FOPDT, other), 0.1),),
     )
-    analysis = replace(fruitless(), models=(found,), selected=0)
+    analysis = replace(fruitless(), models=(found,))
     direct = case_of(analysis, "bag").models_around
     assert len(set(direct)) > 80
     assert from_json(analysis).models_around == direct
@@ -332,7 +332,7 @@ def test_without_a_covariance_a_document_gives_no_models_around() -> None:
         "thyagarajan", Estimate.of(structure, np.array((2.0, 3.0)), np.eye(2) * 1e-4)
     )
     for found in (known, tied):
-        case = from_json(replace(fruitless(), models=(found,), selected=0))
+        case = from_json(replace(fruitless(), models=(found,)))
         assert case.models_around == ()
         assert [e.value for e in case.parameters] == list(found.values)
 
@@ -361,12 +361,12 @@ def test_what_a_controller_may_lack_may_be_left_out(monkeypatch) -> None:
     only(monkeypatch)
     found = completed()
     gains = replace(found.best_gains, kc=-2.814e-05, tf=0.01234, b=0.5)
-    text = read(page([case_of(replace(found, gains=(gains,), recommended=0), "tank")])).text
+    text = read(page([case_of(replace(found, gains=(gains,)), "tank")])).text
     for told in ("kc -2.814e-05 u/y", "tf 0.01234 s", "b 0.5000"):
         assert told in text
     assert text.count("leave out where your controller has none") == 2
     plain = replace(gains, tf=0.0, b=1.0)
-    text = read(page([case_of(replace(found, gains=(plain,), recommended=0), "tank")])).text
+    text = read(page([case_of(replace(found, gains=(plain,)), "tank")])).text
     assert "leave out" not in text
 
 

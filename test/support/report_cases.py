@@ -29,9 +29,7 @@ def aborted(reason: str = "the operator pressed the button") -> Analysis:
     record = replace(found.record, outcome=Outcome.ABORTED, reason=reason)
     why = f"the experiment was aborted: no gains. {reason}"
     judgement = replace(found.judgement, refused=why)
-    return replace(
-        found, record=record, gains=(), recommended=None, reason=why, judgement=judgement
-    )
+    return replace(found, record=record, gains=(), reason=why, judgement=judgement)
 
 
 def fruitless(reason: str = "found no response to the command") -> Analysis:

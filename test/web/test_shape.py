@@ -65,7 +65,8 @@ def test_gains_and_verdict_are_those_of_an_analysis_with_the_same_options(
 
 
 def given(model: TransferFunction) -> PageModel:
-    case = Case("a model", "", 0.0, 0.0, Outcome.UNKNOWN, "", (given_model(model),), 0)
+    given = given_model(model)
+    case = Case("a model", models=(given,), model=given)
     return PageModel(case, Shaping(task_of_model(model)), DesignRequest(), lambda _: "tune")
 
 
