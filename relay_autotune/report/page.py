@@ -8,7 +8,6 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -18,7 +17,6 @@ from relay_autotune.process.transfer_function import process_mathml, process_tex
 from relay_autotune.report.case import Case, ultimate_of
 from relay_autotune.report.figures import PLATES, Plate
 from relay_autotune.report.findings import (
-    Chip,
     beside_present,
     change_of,
     checks_of,
@@ -43,40 +41,6 @@ _NIGHT = (
 )
 
 
-@dataclass(frozen=True)
-class _Drawn:
-    """A figure in the page.
-
-    :param anchor: id of its place.
-    :param title: what it shows.
-    :param reading: how it is to be read.
-    :param wide: True if it fills the page.
-    :param alone: True if nothing stands beside it.
-    :param broad: the SVG for broad screens and paper.
-    :param slim: the SVG for narrow screens; empty: the same.
-    """
-
-    anchor: str
-    title: str
-    reading: str
-    wide: bool
-    alone: bool
-    broad: Markup
-    slim: Markup
-
-
-@dataclass(frozen=True)
-class _Section:
-    """The section of the page about one experiment."""
-
-    case: Case
-    name: str
-    verdict: Chip
-    facts: tuple[str, ...]
-    plates: tuple[_Drawn, ...]
-    left_out: tuple[str, ...]
-
-
 def page(cases: Sequence[Case], *, title: str = "") -> str:
     """Return the report of some experiments as an HTML page.
 
@@ -85,11 +49,10 @@ def page(cases: Sequence[Case], *, title: str = "") -> str:
     :param cases: at least one.
     :param title: of the page; default: the first case's source.
     """
-    environment = _environment()
-    sections = [_section(case, k, len(cases) > 1) for k, case in enumerate(cases, start=1)]
-    return environment.get_template("report.html").render(
+    template = _environment().get_template("report.html")
+    return template.render(
         title=visible(title or cases[0].source),
-        sections=sections,
+        cases=cases,
         version=relay_autotune.__version__,
         **_colours(),
     )
@@ -119,12 +82,13 @@ def _environment() -> Environment:
         "in_units": lambda text, units: Markup(in_units(text, units)),
         "mathml": lambda model: Markup(process_mathml(model)),
     }
-    # What the page says of a case, each by the function that finds the words.
-    said = (
-        *(steps_of, beside_present, change_of, warnings_of, checks_of, numbers_of),
-        *(remarks_of, doubts_of, repeats_of, ultimate_of),
+    # What the page shows of a case, each by the function that finds it.
+    shown = (
+        *(name_of, verdict_of, facts_of, steps_of, beside_present, change_of, warnings_of),
+        *(checks_of, numbers_of, remarks_of, doubts_of, repeats_of, ultimate_of),
+        *(plates_of, drawn),
     )
-    environment.globals |= {function.__name__: function for function in said}
+    environment.globals |= {function.__name__: function for function in shown}
     return environment
 
 
@@ -136,31 +100,29 @@ def _variables(column: int) -> str:
     return " ".join(f"--{name}: {both[column]};" for name, both in COLOURS.items())
 
 
-def _section(case: Case, number: int, many: bool) -> _Section:
-    present = [plate for plate in PLATES if not plate.missing(case)]
-    alone = sum(not plate.wide for plate in present) == 1
+# Parts of the page that its template asks for.
+
+
+def name_of(case: Case) -> str:
+    """Return the heading of an experiment, with its id where its source does not hold that."""
     known = not case.experiment_id or case.experiment_id in case.source
-    name = case.source if known else f"{case.source}, {case.experiment_id}"
-    return _Section(
-        case=case,
-        name=name,
-        verdict=verdict_of(case),
-        facts=facts_of(case, with_id=not many and not known),
-        plates=tuple(_drawn(p, case, f"e{number}", alone=alone) for p in present),
-        left_out=tuple(f"{p.title}: {why}" for p in PLATES if (why := p.missing(case))),
-    )
+    return case.source if known else f"{case.source}, {case.experiment_id}"
 
 
-def _drawn(plate: Plate, case: Case, prefix: str, *, alone: bool) -> _Drawn:
-    anchor = f"{prefix}-{plate.key}"
-    reading = plate.reading_of(case)
+def plates_of(case: Case) -> tuple[list[Plate], list[str]]:
+    """Return the figures of a case, and why it has no others."""
+    missing = [(plate, plate.missing(case)) for plate in PLATES]
+    left_out = [f"{plate.title}: {why}" for plate, why in missing if why]
+    return [plate for plate, why in missing if not why], left_out
 
-    def svg(*, narrow: bool) -> Markup:
-        label = html.escape(f"{plate.title}. {reading}")
-        ids = f"{anchor}-{'narrow' if narrow else 'broad'}"
-        return Markup(inline(plate.figure(case, narrow=narrow), ids, label))
 
-    only = alone and not plate.wide
-    return _Drawn(
-        anchor, plate.title, reading, plate.wide, only, svg(narrow=False), svg(narrow=True)
-    )
+def drawn(plate: Plate, case: Case, prefix: str, *, narrow: bool = False) -> Markup:
+    """Return a figure as SVG.
+
+    :param plate: one for which the case has all.
+    :param case: the experiment.
+    :param prefix: of the ids in it.
+    :param narrow: True if it is for a narrow screen.
+    """
+    label = html.escape(f"{plate.title}. {plate.reading_of(case)}")
+    return Markup(inline(plate.figure(case, narrow=narrow), prefix, label))
