@@ -208,12 +208,10 @@ def beside(
     """
     # here, for they load scipy: a tune is shown with this module, and begins before that
     from relay_autotune.loop.analysis import difference, performance_beside
-    from relay_autotune.report.findings import compared_numbers
+    from relay_autotune.report.findings import compared
 
     now = None if present is None else performance_beside(present, gains, model, added_delay)
-    old = compared_numbers(present, now, gains)
-    both = zip(old, compared_numbers(gains, gains, gains), strict=True)
-    rows = [(name, old, new, unit) for (name, old, unit, _), (_, new, _, _) in both]
+    rows = [(r.name, r.present, r.new, r.unit) for r in compared(present, now, gains)]
     lines = in_columns([("", "present", "new", ""), *rows], width)
     if present is not None:
         lines += labelled("compared", difference(present, now, gains, model), width)

@@ -12,6 +12,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,7 +25,8 @@ from relay_autotune.exchange.models import judgement_of_fields, model_of_fields
 from relay_autotune.identification.estimate import Estimate
 from relay_autotune.identification.limit_cycle.fourier import FrequencyPoint
 from relay_autotune.identification.result import Identification
-from relay_autotune.loop.gains import Controller, Gains
+from relay_autotune.loop.analysis import performance_beside
+from relay_autotune.loop.gains import Controller, Gains, Performance
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import NORMAL_95
@@ -137,6 +139,15 @@ class Case:
     def ultimate(self) -> tuple[EstimatedQuantity, ...]:
         """K_u and w_u of the selected model, empty where it has none."""
         return () if self.model is None else ultimate_of(self.model, self.truth)
+
+    @cached_property
+    def present_does(self) -> Performance | None:
+        """What the present gains do on the model; None: one is not known, or an unstable loop."""
+        if self.model is None or self.present is None:
+            return None
+        return performance_beside(
+            self.present, self.best_gains, self.model.model, self.added_delay
+        )
 
 
 def in_loop(case: Case, model: TransferFunction) -> TransferFunction:

@@ -6,10 +6,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
-from relay_autotune.loop.analysis import as_run, difference, performance_beside
+from relay_autotune.loop.analysis import as_run
 from relay_autotune.loop.gains import Controller, Gains, Performance
 from relay_autotune.report.case import Case
 from relay_autotune.text import date_text, digits, percent, span_text
@@ -17,10 +16,12 @@ from relay_autotune.verdict import Finding, Result, Verdict
 
 Tone = Literal["good", "warn", "bad"]
 
-_MARKS: dict[Tone, str] = {"good": "\N{CHECK MARK}", "warn": "!", "bad": "\N{MULTIPLICATION X}"}
-_TONES: dict[Result, Tone] = {
-    Result.PASSED: "good", Result.DOUBTFUL: "warn", Result.FAILED: "bad",
-}  # fmt: skip
+# A sign that shows the tone without colour, and the tone.
+_TONES: dict[Result, tuple[str, Tone]] = {
+    Result.PASSED: ("\N{CHECK MARK}", "good"),
+    Result.DOUBTFUL: ("!", "warn"),
+    Result.FAILED: ("\N{MULTIPLICATION X}", "bad"),
+}
 _VERDICTS: dict[Verdict, tuple[str, Tone]] = {
     Verdict.TRUSTED: ("gains ready to use", "good"),
     Verdict.DOUBTFUL: ("doubtful gains: read first what to look at", "warn"),
@@ -29,37 +30,21 @@ _VERDICTS: dict[Verdict, tuple[str, Tone]] = {
 }
 
 
-@dataclass(frozen=True)
-class Chip:
-    """The outcome of an experiment in a few words.
-
-    :param text: for people.
-    :param tone: how good it is.
-    """
+class Chip(NamedTuple):
+    """The outcome of an experiment in a few words, and how good it is."""
 
     text: str
     tone: Tone
 
 
-@dataclass(frozen=True)
-class Reason:
-    """One reason to trust a result or not to.
+class CheckRow(NamedTuple):
+    """A reason to trust a result or not to: what was looked at, what was found, its meaning."""
 
-    :param name: what was looked at.
-    :param value: what was found.
-    :param meaning: what that means.
-    :param tone: how good it is.
-    """
-
+    mark: str
+    tone: Tone
     name: str
     value: str
     meaning: str
-    tone: Tone
-
-    @property
-    def mark(self) -> str:
-        """A sign that shows the tone without colour."""
-        return _MARKS[self.tone]
 
 
 # By what present gains are compared with new ones: names, fields, units and meanings.
@@ -75,8 +60,16 @@ _EFFECTS = (
     ("overshoot", "overshoot", "", "after a step of the set-point"),
     ("settling time (2 %)", "settling_time", "s", "after a step of the set-point"),
 )
-# Name, value and unit of a number of gains, and what it means.
-Compared = tuple[str, str, str, str]
+
+
+class Compared(NamedTuple):
+    """A number of present gains, the same of new ones, and what it means."""
+
+    name: str
+    unit: str
+    present: str
+    new: str
+    meaning: str = ""
 
 
 def verdict_of(case: Case) -> Chip:
@@ -133,63 +126,34 @@ def steps_of(case: Case) -> tuple[str, ...]:
     return steps
 
 
-def beside_present(case: Case) -> list[tuple[Compared, Compared]]:
-    """Return each number of the present gains with that of the new ones, both on the model.
-
-    :param case: the experiment; nothing where a model, gains or the present gains are missing.
-    """
-    new, present = case.best_gains, case.present
-    if case.model is None or new is None or present is None:
-        return []
-    old = compared_numbers(present, performance_of(present, case), new)
-    return list(zip(old, compared_numbers(new, new, new), strict=True))
-
-
-def change_of(case: Case) -> str:
-    """Return what the new gains change, in words; empty: the present ones are not known.
-
-    :param case: the experiment.
-    """
-    new, present, found = case.best_gains, case.present, case.model
-    if new is None or present is None or found is None:
-        return ""
-    return difference(present, performance_of(present, case), new, found.model)
-
-
-def performance_of(present: Controller, case: Case) -> Performance | None:
-    """Return what the present gains do on the model; None: no model, or an unstable loop.
-
-    :param present: the gains.
-    :param case: the experiment.
-    """
-    if case.model is None:
-        return None
-    return performance_beside(present, case.best_gains, case.model.model, case.added_delay)
-
-
-def compared_numbers(
-    gains: Controller | None, does: Performance | None, new: Gains | None
+def compared(
+    present: Controller | None, does: Performance | None, new: Gains | None
 ) -> list[Compared]:
-    """Return the numbers by which gains are compared.
+    """Return the numbers by which present gains are compared with new ones.
 
-    :param gains: the gains; None: there are none.
+    :param present: the present gains; None: there are none.
     :param does: what they do on the model; None: they make the loop unstable.
-    :param new: whose law runs them; None: they run continuously.
+    :param new: the new gains, whose law runs both; None: there are none, and it is continuous.
     """
-    jump = digits(as_run(gains, new).jump, 3) if gains else "-"
+    both = ((present, does), (new, new))
 
-    def effect(name: str) -> str:
+    def effect(gains: Controller | None, does: Performance | None, name: str) -> str:
         if gains is None or does is None:
             return "-" if gains is None else "unstable"
         value = getattr(does, name)
         return f"{100.0 * value:.0f} %" if name == "overshoot" else digits(value, 3)
 
-    numbers = ((n, digits(getattr(gains, n)) if gains else "none", unit) for n, unit in _NUMBERS)
-    return [
-        *((*each, "") for each in numbers),
-        *((label, effect(name), unit, meaning) for label, name, unit, meaning in _EFFECTS),
-        ("jump of the command", jump, "u/y", "at once, by a unit step of the set-point"),
+    numbers = [
+        (name, unit, *(digits(getattr(each, name)) if each else "none" for each, _ in both))
+        for name, unit in _NUMBERS
     ]
+    effects = [
+        (label, unit, *(effect(*each, name) for each in both), meaning)
+        for label, name, unit, meaning in _EFFECTS
+    ]
+    jumps = (digits(as_run(each, new).jump, 3) if each else "-" for each, _ in both)
+    jump = ("jump of the command", "u/y", *jumps, "at once, by a unit step of the set-point")
+    return [Compared(*row) for row in (*numbers, *effects, jump)]
 
 
 def repeats_of(case: Case) -> tuple[tuple[str, str], ...]:
@@ -249,23 +213,19 @@ def _noted(case: Case) -> tuple[str, ...]:
     return tuple(found)
 
 
-def checks_of(case: Case) -> tuple[Reason, ...]:
+def checks_of(case: Case) -> tuple[CheckRow, ...]:
     """Return the checks of the result.
 
     :param case: the experiment.
     """
-    return tuple(_check(found) for found in case.judgement.findings)
+    return tuple(map(_check, case.judgement.findings))
 
 
-def _check(found: Finding) -> Reason:
+def _check(found: Finding) -> CheckRow:
     unit = f" {found.unit}" if found.unit else ""
     meaning = found.said if found.sentence else f"{found.what[0].upper()}{found.what[1:]}"
-    return Reason(
-        found.title,
-        f"{_number(found.value)}{unit}, at most {_number(found.limit)}{unit}",
-        f"{meaning}.",
-        _TONES[found.result],
-    )
+    value = f"{_number(found.value)}{unit}, at most {_number(found.limit)}{unit}"
+    return CheckRow(*_TONES[found.result], found.title, value, f"{meaning}.")
 
 
 def _number(value: float) -> str:

@@ -24,7 +24,6 @@ from relay_autotune.process.frequencies import frequencies
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.quantities import NORMAL_95
 from relay_autotune.report.case import Case, EstimatedQuantity, in_loop, ultimate_of
-from relay_autotune.report.findings import performance_of
 from relay_autotune.report.style import (
     BLUE,
     GREEN,
@@ -403,10 +402,9 @@ def simulated_before(case: Case, model: TransferFunction, half: float) -> Closed
     :param model: the process, with all dead time of the loop.
     :param half: as of `simulated`.
     """
-    present = case.present
-    if present is None or performance_of(present, case) is None:
+    if case.present is None or case.present_does is None:
         return None
-    return simulated(present, model, half)
+    return simulated(case.present, model, half)
 
 
 def draw_rules(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:

@@ -13,13 +13,13 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import relay_autotune
+from relay_autotune.loop.analysis import difference
 from relay_autotune.process.transfer_function import process_mathml, process_text
 from relay_autotune.report.case import Case, ultimate_of
 from relay_autotune.report.figures import PLATES, Plate
 from relay_autotune.report.findings import (
-    beside_present,
-    change_of,
     checks_of,
+    compared,
     doubts_of,
     facts_of,
     numbers_of,
@@ -84,7 +84,7 @@ def _environment() -> Environment:
     }
     # What the page shows of a case, each by the function that finds it.
     shown = (
-        *(name_of, verdict_of, facts_of, steps_of, beside_present, change_of, warnings_of),
+        *(name_of, verdict_of, facts_of, steps_of, compared, difference, warnings_of),
         *(checks_of, numbers_of, remarks_of, doubts_of, repeats_of, ultimate_of),
         *(plates_of, drawn),
     )

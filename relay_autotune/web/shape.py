@@ -23,7 +23,6 @@ from relay_autotune.loop.analysis import Loop, abscissae, inverted
 from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.quantities import Quantity, declared
 from relay_autotune.report.case import Case
-from relay_autotune.report.findings import performance_of
 from relay_autotune.report.frequency import (
     loop_frequencies,
     shown_load,
@@ -268,7 +267,7 @@ class PageModel:
     def before(self) -> Steps | None:
         """Return both steps with the present gains; None: they are not known, or unstable."""
         case, shaping = self.case, self.shaping
-        if case.present is None or shaping is None or performance_of(case.present, case) is None:
+        if case.present is None or case.present_does is None or shaping is None:
             return None
         loop = Loop(case.present, shaping.task.process)
         return _steps(loop, shaping.task, np.empty(0, dtype=bool), *self._scale(case.present))

@@ -24,9 +24,8 @@ from relay_autotune.record.record import Record
 from relay_autotune.report.case import Case, EstimatedQuantity, parameters_of, ultimate_of
 from relay_autotune.report.findings import (
     checks_of,
-    compared_numbers,
+    compared,
     facts_of,
-    performance_of,
     remarks_of,
     verdict_of,
     warnings_of,
@@ -147,11 +146,11 @@ def of_present(subject: PageModel) -> dict[str, Any]:
     case, before = subject.case, subject.before()
     if case.present is None or case.model is None:
         return {"rows": [], "steps": None}
-    rows = compared_numbers(case.present, performance_of(case.present, case), case.best_gains)
+    rows = compared(case.present, case.present_does, case.best_gains)
     steps = None
     if before is not None:
         steps = [short(each) for each in (before.time, before.measurement, before.command)]
-    shown = [[f"{name} [{unit}]" if unit else name, value] for name, value, unit, _ in rows]
+    shown = [[f"{r.name} [{r.unit}]" if r.unit else r.name, r.present] for r in rows]
     return {"rows": shown, "steps": steps}
 
 
@@ -186,7 +185,7 @@ def of_shaped(subject: PageModel, shaped: DesignResult) -> dict[str, Any]:
         "isa": [[n, digits(v), unit, meaning] for n, v, unit, meaning in isa],
         "parallel": [[n, digits(v), unit] for n, v, unit in parallel],
         "effects": _effects(shaped),
-        "beside": [value for _, value, *_ in compared_numbers(gains, gains, gains)],
+        "beside": [row.new for row in compared(None, None, gains)],
         "at": short(np.array([gains.ms, gains.iae_load])),
         "b": gains.b,
         "ms": gains.ms,
@@ -248,9 +247,7 @@ def _verdict(case: Case) -> dict[str, str]:
 
 
 def _checks(case: Case) -> list[list[str]]:
-    return [
-        [c.mark, c.tone, c.name, visible(c.value), visible(c.meaning)] for c in checks_of(case)
-    ]
+    return [list(map(visible, check)) for check in checks_of(case)]
 
 
 def _estimate(estimate: EstimatedQuantity) -> list[str]:

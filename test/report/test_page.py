@@ -46,8 +46,8 @@ from relay_autotune.report.case import (
 )
 from relay_autotune.report.figures import PLATES
 from relay_autotune.report.findings import (
-    beside_present,
-    change_of,
+    Compared,
+    compared,
     remarks_of,
     warnings_of,
 )
@@ -107,6 +107,10 @@ def read(text: str) -> Reader:
     found.close()
     assert found.open == []
     return found
+
+
+def beside(case: Case) -> list[Compared]:
+    return compared(case.present, case.present_does, case.best_gains)
 
 
 def from_json(analysis) -> Case:
@@ -385,15 +389,15 @@ def test_the_present_gains_stand_beside_the_new_ones_with_what_both_do(monkeypat
     case = case_of(completed(), "tank")
     assert "Beside the present gains" not in read(page([case])).text
     weak = Controller(0.5 * case.best_gains.kc, case.best_gains.ti)
-    rows = {row[0]: (row[1], new[1]) for row, new in beside_present(replace(case, present=weak))}
+    rows = {r.name: (r.present, r.new) for r in beside(replace(case, present=weak))}
     assert float(rows["kc"][0]) == pytest.approx(weak.kc, rel=1e-3)
     expected = analyse_loop(weak, in_loop(case, case.model.model))
     assert float(rows["Ms"][0]) == pytest.approx(expected.ms, rel=1e-2)
     assert float(rows["Ms"][1]) == pytest.approx(case.best_gains.ms, rel=1e-2)
     assert "Beside the present gains" in read(page([replace(case, present=weak)])).text
     wild = replace(case, present=Controller(10.0 * case.best_gains.kc, 1.0))
-    assert dict(row[0][:2] for row in beside_present(wild))["overshoot"] == "unstable"
-    assert "loop unstable" in change_of(wild)
+    assert {r.name: r.present for r in beside(wild)}["overshoot"] == "unstable"
+    assert "loop unstable" in read(page([wild])).text
     assert rows["overshoot"][0] == f"{100.0 * expected.overshoot:.0f} %"
     new = case.best_gains
     jumps = [float(text) for text in rows["jump of the command"]]
