@@ -24,7 +24,7 @@ from relay_autotune.quantities import NORMAL_95
 from relay_autotune.record.cycles import cycles_of
 from relay_autotune.record.record import Cycle, Record
 from relay_autotune.text import digits, in_units, plus_minus
-from relay_autotune.tuning.ensemble import PredictedMs, ms_on_each
+from relay_autotune.tuning.ensemble import ms_on_each
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 from relay_autotune.verdict import NOT_JUDGED, Finding, Judgement, Verdict, judge
 
@@ -97,8 +97,8 @@ class Analysis:
     :param added_delay: dead time beside the process's own with which the gains were judged [s]:
         half a sampling period of the controller, and what else its loop adds.
     :param judgement: findings of the checks, and the verdict.
-    :param predicted: for a running experiment, Ms with the gains of its model; None: not asked
-        for, or no gains.
+    :param predicted: for a running experiment, Ms with the gains of its model, and the ends of its
+        95 % interval; empty: not asked for, or no gains.
     :param shaping: all that is needed to design other gains; None: no gains are allowed.
     """
 
@@ -108,7 +108,7 @@ class Analysis:
     reason: str = ""
     added_delay: float = 0.0
     judgement: Judgement = NOT_JUDGED
-    predicted: PredictedMs | None = None
+    predicted: tuple[float, ...] = ()
     shaping: Shaping | None = None
 
     @property
@@ -134,11 +134,9 @@ class Analysis:
     @property
     def finding(self) -> FitProgress:
         """Result of the fit and its prediction for a running experiment."""
-        model, ms = self.model, self.predicted
-        if model is None:
+        if (model := self.model) is None:
             return FitProgress()
-        found = FitProgress(model.ultimate_gain, model.ultimate_gain_std)
-        return found if ms is None else replace(found, ms=ms.ms, ms_low=ms.low, ms_high=ms.high)
+        return FitProgress(model.ultimate_gain, model.ultimate_gain_std, *self.predicted)
 
     def __repr__(self) -> str:
         """Return model, verdict and gains on ten lines at most; the fields have the rest."""

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -94,38 +94,24 @@ def ensemble_ms(law: ControlLaw, models: ModelSet) -> float:
     return value
 
 
-@dataclass(frozen=True)
-class PredictedMs:
-    """Largest magnitude of the sensitivity function with the gains of a rule.
-
-    :param ms: on the model.
-    :param low: lower end of its 95 % interval.
-    :param high: upper end; infinite where more than 2.5 % of the loops are unstable.
-    """
-
-    ms: float
-    low: float
-    high: float
-
-
-def predicted_ms(task: DesignTask, rule: Rule) -> PredictedMs | None:
-    """Return the Ms of the gains that a rule gives for the model alone, and its interval.
+def predicted_ms(task: DesignTask, rule: Rule) -> tuple[float, ...]:
+    """Return the Ms of the gains that a rule gives for the model alone, and its 95 % interval.
 
     The interval holds 95 % of the Ms that the same gains have on the models within the
-    uncertainty.
+    uncertainty; its upper end is infinite where more than 2.5 % of the loops are unstable.
 
     :param task: the process, the models within its uncertainty, and what is asked for.
     :param rule: gives the gains, from the model alone.
-    :return: None where the rule does not apply, or the uncertainty is not known.
+    :return: empty where the rule does not apply, or the uncertainty is not known.
     """
     if not task.models:
-        return None
+        return ()
     try:
         controller, _ = rule(replace(task, models=()))
     except TuningError:
-        return None
+        return ()
     models = task.set_of((task.model, *task.models))
     own, *others = ms_on_each(task.law(controller), models)
     # No interpolation: some values may be infinite.
-    low, high = np.quantile(others, (0.025, 0.975), method="closest_observation")
-    return PredictedMs(float(own), float(low), float(high))
+    ends = np.quantile(others, (0.025, 0.975), method="closest_observation")
+    return float(own), *map(float, ends)
