@@ -99,6 +99,7 @@ class GainsPage:
         for subject in self.page.subjects:
             if subject.loop == self.number and subject.case.present != present:
                 subject.case = replace(subject.case, present=present)
+                self.page.changed()
 
     def look_after_tune(self, tune: Tuned) -> None:
         """Read the gains in force; those of the tune may be proven.

@@ -30,7 +30,6 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from relay_autotune.errors import RelayAutotuneError, SelectionError, TuningError, defect
 from relay_autotune.exchange.export import EXPORTS, exported, exports_of, file_name
-from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.report.page import page as report_page
 from relay_autotune.report.page import style_sheet
@@ -361,7 +360,6 @@ class _Socket(_Guarded, WebSocketHandler):
         self._told: dict[int, tuple[DesignRequest, int]] = {}
         self._asked: dict[int, DesignRequest] = {}
         self._waits: asyncio.Task[None] | None = None
-        self._present: dict[int, Controller | None] = {}
         self._shown = 0
         # Everything includes what is new until now.
         self.page.tell_news()
@@ -464,10 +462,6 @@ class _Socket(_Guarded, WebSocketHandler):
             if (asked, len(known)) != self._told.get(number):
                 self._told[number] = asked, len(known)
                 self.tell(wire.to_text({"of": number, "trade_off": known}))
-            if subject.case.present != self._present.get(number):
-                self._present[number] = subject.case.present
-                rows = wire.of_present(subject)
-                self.tell(wire.to_text({"of": number, "present": rows}))
 
 
 def _read(text: str | bytes) -> Any:

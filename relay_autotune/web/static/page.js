@@ -165,14 +165,6 @@ function gainsWords(s) {
     .map(([name, value, unit]) => `${name} ${value}${unit ? ` ${unit}` : ""}`);
 }
 
-function showBeside() {
-  const { rows } = subjects[chosen].present;
-  $("beside-box").hidden = !(rows.length && shaped);
-  if (shaped) table($("beside"), rows.map(([name, now], k) => [name, now, shaped.beside[k]]), []);
-  if (shaped) showSteps(shaped.steps);
-  if (live) live.showForce();
-}
-
 // A step of the set-point and one of the load, behind it those of the present gains.
 function showSteps(t) {
   const { steps } = subjects[chosen].present;
@@ -199,13 +191,16 @@ function showShaped(s, sketched) {
     $("command").textContent = s.command;
     showKeep(s.exports);
     showTrade();
+    const { rows } = subjects[chosen].present;
+    $("beside-box").hidden = !rows.length;
+    table($("beside"), rows.map(([name, now], k) => [name, now, s.beside[k]]), []);
+    if (live) live.showForce();
   }
   $("gains").textContent = sketched ? "about " : "";
   for (const words of gainsWords(s)) { put($("gains"), "span", words); $("gains").append("   "); }
   table($("isa"), s.isa, ["", "number", "unit", "meaning"]);
   table($("parallel"), s.parallel, ["", "number", "unit"]);
   table($("effects"), s.effects, ["", "", "interval"]);
-  if (!sketched) showBeside();
   $("why").textContent = `Rule ${s.rule}: ${s.reason}`;
   const notes = [...s.warnings, ...s.remarks];
   $("notes").hidden = !notes.length;
@@ -394,7 +389,7 @@ function take(message) {
     // After a tune its own result is shown, else what the address says.
     if (!own.length) showLoop();
     else if (before && newest < before) {
-      // Other rules of the same model have come.
+      // Other rules of the same model have come, or the present gains are others.
       showSubject();
       showControls();
       if (shaped) showShaped(shaped, false);
@@ -405,11 +400,6 @@ function take(message) {
   if (message.trade_off) {
     trades[message.of] = message.trade_off;
     if (message.of === chosen) { trade = message.trade_off; showTrade(); }
-    return;
-  }
-  if (message.present) {
-    subjects[message.of].present = message.present;
-    if (message.of === chosen) showBeside();
     return;
   }
   const { sketched } = message.answer;
