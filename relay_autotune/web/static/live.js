@@ -3,7 +3,7 @@
 
 // The loop as it runs: samples as they come, what the tune does in words, and what can be wished.
 
-import { Plot } from "./plot.js";
+import { Plot, button, put } from "./plot.js";
 
 const $ = (id) => document.getElementById(id);
 // More points than this are not kept, some for each pixel of a figure.
@@ -13,28 +13,15 @@ const IDLE = { "": "ready", good: "ready", warn: "ready", bad: "not done" };
 const TONES = { settling: "warn", kick: "warn", relay: "warn", completed: "good", aborted: "bad", failed: "bad" };
 
 export function table(host, rows, cells) {
-  const body = document.createElement("tbody");
+  host.replaceChildren();
+  const body = host.tagName === "TBODY" ? host : put(host, "tbody");
   for (const row of rows) {
-    const line = document.createElement("tr");
+    const line = put(body, "tr");
     row.forEach((text, k) => {
-      const cell = document.createElement(k === 0 ? "th" : "td");
-      cell.textContent = text;
-      if (cells[k]) cell.className = cells[k];
+      const cell = put(line, k === 0 ? "th" : "td", text, cells[k]);
       if (k === 0) cell.scope = "row";
-      line.append(cell);
     });
-    body.append(line);
   }
-  host.replaceChildren(...(host.tagName === "TBODY" ? body.children : [body]));
-}
-
-function texts(host, name, lines) {
-  if (host.children.length === lines.length) return;
-  host.replaceChildren(...lines.map((line) => {
-    const made = document.createElement(name);
-    made.textContent = line;
-    return made;
-  }));
 }
 
 // The samples of a signal. Where there are too many, every second one of the older half is dropped.
@@ -174,7 +161,7 @@ export class Live {
       this.showLoops();
       // A plan must not stand before what ends a tune.
       if (loop.running && !(before && before.phase === loop.phase)) this.plan.close();
-      if (loop === this.loop) this.show(before);
+      if (loop === this.loop) this.show();
     }
     if (loop !== this.loop) return;
     const { proof, model } = message.shown || {};
@@ -206,7 +193,7 @@ export class Live {
     this.loop = loop;
     $("live-cycles").replaceChildren();
     this.showLoops();
-    this.show(null);
+    this.show();
     this.showModel(loop.shown.model);
     this.showProof(loop.shown.proof || []);
     this.draw();
@@ -221,19 +208,11 @@ export class Live {
     if (host.hidden || this.words === words) return;
     this.words = words;
     host.replaceChildren();
-    const button = (text, work) => {
-      const made = document.createElement("button");
-      made.type = "button";
-      made.textContent = text;
-      made.addEventListener("click", work);
-      host.append(made);
-      return made;
-    };
     for (const loop of this.loops.filter((each) => each && each.told)) {
-      const tab = button(`${loop.told.node}: ${loop.phase}`, () => this.choose(loop));
+      const tab = button(host, `${loop.told.node}: ${loop.phase}`, () => this.choose(loop));
       tab.setAttribute("aria-pressed", String(loop === this.loop));
       if (loop.running && loop !== this.loop) {
-        button(`Abort ${loop.told.node}`, () => this.send("abort", {}, loop)).className = "stop";
+        button(host, `Abort ${loop.told.node}`, () => this.send("abort", {}, loop)).className = "stop";
       }
     }
   }
@@ -277,7 +256,7 @@ export class Live {
     document.body.dataset.measured = measurement.count ? measurement.last : "";
   }
 
-  show(before) {
+  show() {
     const told = this.told;
     $("live").hidden = false;
     $("live-bar").hidden = !this.loop.running;
@@ -295,8 +274,11 @@ export class Live {
     $("progress").value = told.progress || 0;
     const left = told.remaining > 0 ? `, about ${told.remaining.toFixed(0)} s left` : "";
     $("live-times").textContent = tuning ? `${told.elapsed.toFixed(0)} s so far${left}` : "";
-    if (before && before.cycles.length > told.cycles.length) $("live-cycles").replaceChildren();
-    texts($("live-cycles"), "li", told.cycles);
+    const cycles = $("live-cycles");
+    if (cycles.children.length !== told.cycles.length) {
+      cycles.replaceChildren();
+      for (const line of told.cycles) put(cycles, "li", line);
+    }
     $("live-process").textContent = told.process;
     this.showPlan();
     $("result-box").hidden = !told.result.length;

@@ -6,7 +6,7 @@
 
 import { Live, table } from "./live.js";
 import { Plan } from "./plan.js";
-import { Plot, units } from "./plot.js";
+import { Plot, button, put, units } from "./plot.js";
 
 const $ = (id) => document.getElementById(id);
 const pick = (rule) => { asked.rule = rule; showControls(); ask(); };
@@ -31,14 +31,6 @@ let waiting = 0; // number of the question that has no answer yet; 0: none
 let number = 0;
 let changed = false; // the controls changed while an answer was awaited
 let begun = 0;
-
-function put(parent, name, text, kind) {
-  const made = document.createElement(name);
-  if (text !== undefined) made.textContent = text;
-  if (kind) made.className = kind;
-  parent.append(made);
-  return made;
-}
 
 // What is asked stands in the address, so that a page that is loaded again shows the same.
 function remember() {
@@ -228,13 +220,8 @@ function showKeep(exports) {
   if (keeps === String(exports)) return;
   keeps = String(exports);
   $("keep").replaceChildren();
-  const keep = (words, work) => {
-    const button = put($("keep"), "button", words);
-    button.type = "button";
-    button.addEventListener("click", work);
-  };
-  keep("Report as one file", () => download("report.html", {}));
-  for (const name of exports) keep(exported(name), () => exportGains(name));
+  button($("keep"), "Report as one file", () => download("report.html", {}));
+  for (const name of exports) button($("keep"), exported(name), () => exportGains(name));
 }
 
 function showRefused(text) {
@@ -278,10 +265,8 @@ function showSubject() {
   const here = subjects.map((each, k) => [each, k]).filter(([each]) => each.loop === subject.loop);
   $("tabs").hidden = here.length < 2;
   here.forEach(([each, k]) => {
-    const button = put($("tabs"), "button", each.when ? `tune at ${each.when}` : each.name);
-    button.type = "button";
-    button.setAttribute("aria-pressed", String(k === chosen));
-    button.addEventListener("click", () => choose(k));
+    const tab = button($("tabs"), each.when ? `tune at ${each.when}` : each.name, () => choose(k));
+    tab.setAttribute("aria-pressed", String(k === chosen));
   });
 }
 

@@ -3,7 +3,7 @@
 
 // The plan: what will be done, what is asked for it, and whether it is agreed to.
 
-import { inUnits } from "./plot.js";
+import { inUnits, put } from "./plot.js";
 
 const $ = (id) => document.getElementById(id);
 // Time without a key after which what was typed is looked at [ms].
@@ -13,18 +13,12 @@ const PLAN = ["moves", "within", "switches", "holds", "levels", "limits", "at re
 const MARKS = { ok: ["\u2713", "good"], note: ["!", "warn"], NO: ["\u2715", "bad"] };
 
 function checklist(host, checks) {
-  host.replaceChildren(...checks.map(([mark, name, found]) => {
+  host.replaceChildren();
+  for (const [mark, name, found] of checks) {
     const [sign, tone] = MARKS[mark] || [mark, ""];
-    const line = document.createElement("li");
-    line.className = tone;
-    for (const [kind, text] of [["mark", sign], ["name", name], ["found", found]]) {
-      const part = document.createElement("span");
-      part.className = kind;
-      part.textContent = text;
-      line.append(part);
-    }
-    return line;
-  }));
+    const line = put(host, "li", undefined, tone);
+    for (const [kind, text] of [["mark", sign], ["name", name], ["found", found]]) put(line, "span", text, kind);
+  }
 }
 
 export class Plan {
@@ -120,24 +114,19 @@ export class Plan {
 
   showForm() {
     for (const { name, question, unit, values, ends, now, needed } of this.form) {
-      const row = document.createElement("div");
-      const label = document.createElement("label");
-      label.textContent = inUnits(`${question} [${unit}]`);
-      row.append(label);
-      const fields = document.createElement("span");
+      const row = put($("form"), "div");
+      const label = put(row, "label", inUnits(`${question} [${unit}]`));
+      const fields = put(row, "span");
       for (let k = 0; k < ends; k += 1) {
-        const input = document.createElement("input");
+        const input = put(fields, "input");
         Object.assign(input, { name, type: "number", step: "any", value: values && values[k] !== null ? values[k] : "" });
         if (!needed) input.placeholder = "as it is";
         input.id = `form-${name}-${k}`;
         input.setAttribute("aria-describedby", "plan-said");
         if (k === 0) label.htmlFor = input.id;
         else input.setAttribute("aria-label", `${question}, upper end`);
-        fields.append(input);
       }
       if (now) fields.append(now);
-      row.append(fields);
-      $("form").append(row);
     }
   }
 }

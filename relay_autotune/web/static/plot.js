@@ -1,7 +1,23 @@
 // Copyright 2026 the developers of relay_autotune
 // SPDX-License-Identifier: Apache-2.0
 
-// Small figures in SVG. Colours and dashes come from the style sheet, by the class of a curve.
+// Elements of the page, and small figures in SVG. Colours and dashes come from the style sheet, by
+// the class of a curve.
+
+export function put(parent, name, text, kind) {
+  const made = document.createElement(name);
+  if (text !== undefined) made.textContent = text;
+  if (kind) made.className = kind;
+  parent.append(made);
+  return made;
+}
+
+export function button(parent, text, work) {
+  const made = put(parent, "button", text);
+  made.type = "button";
+  made.addEventListener("click", work);
+  return made;
+}
 
 const SVG = "http://www.w3.org/2000/svg";
 
@@ -53,9 +69,7 @@ export class Plot {
     this.words = words;
     this.drawn = null;
     this.svg = element("svg", { role: "img", "aria-label": words.label }, host);
-    this.legend = document.createElement("ul");
-    this.legend.className = "legend";
-    host.append(this.legend);
+    this.legend = put(host, "ul", undefined, "legend");
     new ResizeObserver(() => this.redraw()).observe(host);
   }
 
@@ -174,12 +188,11 @@ export class Plot {
     const key = named.map((each) => each.name + each.kind).join();
     if (this.key === key) return;
     this.key = key;
-    this.legend.replaceChildren(...named.map((each) => {
-      const item = document.createElement("li");
-      const swatch = document.createElement("span");
-      swatch.className = `swatch ${each.kind} ${each.low ? "band" : ""}`;
-      item.append(swatch, each.name);
-      return item;
-    }));
+    this.legend.replaceChildren();
+    for (const each of named) {
+      const item = put(this.legend, "li");
+      put(item, "span", undefined, `swatch ${each.kind} ${each.low ? "band" : ""}`);
+      item.append(each.name);
+    }
   }
 }
