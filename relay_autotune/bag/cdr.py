@@ -341,13 +341,6 @@ class _Cursor:
                 return
 
 
-# numpy's types as the module struct names them
-_FORMATS = {
-    "u1": "B", "i1": "b", "u2": "H", "i2": "h", "u4": "I", "i4": "i", "u8": "Q", "i8": "q",
-    "f4": "f", "f8": "d",
-}  # fmt: skip
-
-
 def decode_messages(
     channel: Channel, payload: Iterable[bytes], defaults: Mapping[str, Any]
 ) -> list[Any]:
@@ -433,7 +426,7 @@ class _Decoder:
 
     def _number(self, kind: Number) -> Any:
         self._align(kind.size)
-        (value,) = struct.unpack_from(self._order + _FORMATS[kind.form], self._data, self._at)
+        (value,) = struct.unpack_from(self._order + kind.form, self._data, self._at)
         self._at += kind.size
         return bool(value) if kind.name == "bool" else value
 

@@ -23,6 +23,7 @@ import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from struct import calcsize
 from typing import Any
 
 from relay_autotune.errors import FieldError, visible
@@ -33,7 +34,7 @@ class Number:
     """A number.
 
     :param name: as ROS calls it, such as ``float64``.
-    :param form: its type for numpy without byte order; a bool is one byte.
+    :param form: its letter in ``struct`` and numpy; a bool is one byte.
     """
 
     name: str
@@ -42,7 +43,7 @@ class Number:
     @property
     def size(self) -> int:
         """Its size, which is also its alignment [bytes]."""
-        return int(self.form[1:])
+        return calcsize(f"<{self.form}")
 
 
 @dataclass(frozen=True)
@@ -81,10 +82,11 @@ Fields = tuple[tuple[str, Type], ...]
 
 
 _FORMS = {
-    **dict.fromkeys(("bool", "byte", "octet", "char"), "u1"),
-    **{f"{'u' * (k == 'u')}int{8 * n}": f"{k}{n}" for k in "iu" for n in (1, 2, 4, 8)},
-    "float32": "f4",
-    "float64": "f8",
+    **dict.fromkeys(("bool", "byte", "octet", "char"), "B"),
+    **{f"int{8 << k}": form for k, form in enumerate("bhiq")},
+    **{f"uint{8 << k}": form for k, form in enumerate("BHIQ")},
+    "float32": "f",
+    "float64": "d",
 }
 # The numbers by the names that ROS has for them.
 NUMBERS = {name: Number(name, form) for name, form in _FORMS.items()}
@@ -317,7 +319,7 @@ def _names_of(
     own, lists = key or _OWN_NAME, (key,) if key else NAME_LISTS
     if isinstance(array.item, Struct):
         kind = dict(array.item.fields).get(own)
-        whole = bool(key) and isinstance(kind, Number) and kind.form[0] in "ui"
+        whole = bool(key) and isinstance(kind, Number) and kind.form not in "fd"
         if whole or (isinstance(kind, Text) and not kind.wide):
             return Names(own, None)
     for depth, struct in reversed(around):

@@ -167,12 +167,12 @@ class CommandMessage:
         except FieldError as error:
             raise ParameterError(f"command_field: {error}") from None
         number = _number_of(root, steps)
-        if number.form[0] != "f":
+        if number.form not in "fd":
             raise ParameterError(
                 f"command_field: {self.field} of {type_name} is a {number.name}; expected a "
                 f"float32 or float64, which can hold the relay's levels"
             )
-        self._is_single = number.form == "f4"
+        self._is_single = number.form == "f"
         self.value: Callable[[Any], float] = reading(steps)
         """Returns the command in a message [u]; raises `FieldError` if it does not tell it."""
         self._put = setting(steps)
