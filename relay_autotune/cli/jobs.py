@@ -318,9 +318,6 @@ def design_options(options: argparse.Namespace) -> DesignOptions:
     :raises SelectionError: if a value is out of its range, or --export names no program.
     """
     given = given_quantities(options, declared(DesignOptions))
-    low, high = (getattr(options, f"command_{end}", None) for end in ("min", "max"))
-    if low is not None and high is not None and low >= high:
-        raise SelectionError(f"--command-min {low:g} is not below --command-max {high:g}")
     export = getattr(options, "export", None)
     problem = Quantity("--export", "", choices=("", *EXPORTS)).problem(export or "")
     if problem is not None:

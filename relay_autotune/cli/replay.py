@@ -195,7 +195,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
 
     :raises SelectionError: if options contradict each other, or a name is unknown.
     """
-    with_table = not (options.json or options.output)
+    with_table, target = not (options.json or options.output), export_target(options)
     recordings = _recordings(options.bags)
     jobs = jobs_of(options, recordings, table_width=width() if with_table else None)
     jobs = [replace(j, form=options.form, accept_doubtful=options.accept_doubtful) for j in jobs]
@@ -213,7 +213,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
             )
         if options.json:
             raise SelectionError("--export writes a file of its own: leave out --json")
-        jobs = [replace(jobs[0], export=(options.export, export_target(options)))]
+        jobs = [replace(jobs[0], export=(options.export, target))]
     return jobs
 
 

@@ -510,7 +510,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if rule not in RULES:
         raise SelectionError(f"unknown rule {rule!r}; known: {', '.join(RULES)}")
     check_web(options)
-    asked = design_options(options)
+    asked, target = design_options(options), export_target(options)
     if asked.law and not asked.sample_period:
         raise SelectionError(
             f"{asked.law} runs at a sampling period: give it with --sample-period S"
@@ -519,7 +519,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     found = _Designs(task, rule, options.form, options.table)
     if options.export is not None:
         (gains,) = found.gains
-        write(exported(gains, options.export, export_target(options)), options.output)
+        write(exported(gains, options.export, target), options.output)
         for warning in gains.warnings:
             say(PROGRAM, warning)
     elif options.json:

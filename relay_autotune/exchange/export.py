@@ -76,7 +76,7 @@ class Target:
             )
         if not self.command_min < self.command_max:
             raise SelectionError(
-                f"the lower clamp {self.command_min:g} must be below the upper one, "
+                f"--command-min {self.command_min:g} is not below --command-max "
                 f"{self.command_max:g}"
             )
 
