@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from relay_autotune.errors import ParameterError
+from relay_autotune.errors import ParameterError, look_up
 from relay_autotune.quantities import result_field
 from relay_autotune.text import digits
 
@@ -207,8 +207,4 @@ def verdict_named(name: str) -> Verdict:
 
     :raises ParameterError: if the name is unknown.
     """
-    try:
-        return Verdict[name.upper()]
-    except KeyError:
-        known = ", ".join(v.name.lower() for v in Verdict)
-        raise ParameterError(f"verdict {name!r} is not one of {known}") from None
+    return look_up({v.name.lower(): v for v in Verdict}, name, "verdict", ParameterError)
