@@ -3,9 +3,8 @@
 
 // The loop as it runs: samples as they come, what the tune does in words, and what can be wished.
 
-import { Plot, button, put } from "./plot.js";
+import { $, Plot, button, put } from "./plot.js";
 
-const $ = (id) => document.getElementById(id);
 // More points than this are not kept, some for each pixel of a figure.
 const MOST = 2000;
 // What stands for a loop at which nothing is done, by how the last thing went.
@@ -56,6 +55,8 @@ class Signal {
 
 // Time that is shown while no tune has run [s].
 const LAST = 60;
+
+const curve = ([x, y], kind, name) => ({ x, y, kind, name });
 
 // The values of a signal within a time; the one before it holds at its beginning.
 function within(signal, [from, to]) {
@@ -312,7 +313,6 @@ export class Live {
     table($("live-estimates"), model ? model.estimates : [], ["", "", "unit", "interval"]);
     if (!model) return;
     const [data, drawn] = model.data || [[[], []], [[], []]];
-    const curve = ([x, y], kind, name) => ({ x, y, kind, name });
     this.model.draw({ curves: [curve(data, "measured", "measurement"), curve(drawn, "model", "model")] });
     const { cycle, value, low, high } = model.gains;
     const sure = low.map((each, k) => k).filter((k) => low[k] !== null);
@@ -331,7 +331,6 @@ export class Live {
     $("proof").hidden = !(this.told.proof.length && steps.length);
     if (!steps.length) return;
     const [step] = steps;
-    const curve = ([x, y], kind, name) => ({ x, y, kind, name });
     this.proof.draw({
       curves: [curve(step.measurement, "measured", "measured"), curve(step.predicted, "model", "predicted")],
       said: `${step.name}, ${step.passed ? "as predicted" : "not as predicted"}`,

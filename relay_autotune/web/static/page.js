@@ -6,9 +6,8 @@
 
 import { Live, table } from "./live.js";
 import { Plan } from "./plan.js";
-import { Plot, button, put, units } from "./plot.js";
+import { $, Plot, button, put, units } from "./plot.js";
 
-const $ = (id) => document.getElementById(id);
 const pick = (rule) => { asked.rule = rule; showControls(); ask(); };
 const plots = {
   measurement: new Plot($("plot-measurement"), { label: "Measurement after both steps", y: "measurement [y]" }),
@@ -25,7 +24,7 @@ let keeps = ""; // the kinds of files that are offered
 let chosen = -1; // number of the model that is shown
 let asked = null; // what the controls say
 let shaped = null; // what was answered last
-let trade = [];
+const trades = []; // by model: kind, Ms and IAE of the controllers that are known
 let socket = null;
 let waiting = 0; // number of the question that has no answer yet; 0: none
 let number = 0;
@@ -145,7 +144,7 @@ function showTrade() {
     .map((each) => ({ x: each.ms[0], y: each.ms[1], kind: each.rule === asked.rule ? "chosen" : "rule", name: each.rule }));
   if (shaped) marks.push({ x: shaped.at[0], y: shaped.at[1], kind: "here", name: "" });
   const curves = ["pi", "pid"].map((kind) => {
-    const points = trade.filter((p) => p[0] === kind && p[2] !== null).sort((a, b) => a[1] - b[1]);
+    const points = (trades[chosen] || []).filter((p) => p[0] === kind && p[2] !== null).sort((a, b) => a[1] - b[1]);
     return { x: points.map((p) => p[1]), y: points.map((p) => p[2]), kind, name: kind.toUpperCase() };
   }).filter((curve) => curve.x.length > 1);
   const said = shaped ? `here Ms ${shaped.at[0]}, IAE ${shaped.at[1]} y s/u` : "";
@@ -285,14 +284,12 @@ function choose(k) {
   // Those of another model.
   $("gains").textContent = subjects[k].may_shape ? "" : "no gains";
   $("notes").hidden = true;
-  trade = trades[k] || [];
   asked = remembered(subjects[k]);
   showSubject();
   showControls();
   showOf();
   ask();
 }
-const trades = [];
 
 // A law is that of a program; the others are forms of a file.
 function exported(name) { return `Gains ${laws.includes(name) ? "for" : "as"} ${name}`; }
@@ -384,7 +381,7 @@ function take(message) {
   }
   if (message.trade_off) {
     trades[message.of] = message.trade_off;
-    if (message.of === chosen) { trade = message.trade_off; showTrade(); }
+    if (message.of === chosen) showTrade();
     return;
   }
   const { sketched } = message.answer;

@@ -3,9 +3,8 @@
 
 // The plan: what will be done, what is asked for it, and whether it is agreed to.
 
-import { inUnits, put } from "./plot.js";
+import { $, inUnits, put } from "./plot.js";
 
-const $ = (id) => document.getElementById(id);
 // Time without a key after which what was typed is looked at [ms].
 const TYPED = 500;
 // Checks that say what a tune will do; of the others those that passed are folded away.

@@ -4,6 +4,8 @@
 // Elements of the page, and small figures in SVG. Colours and dashes come from the style sheet, by
 // the class of a curve.
 
+export const $ = (id) => document.getElementById(id);
+
 export function put(parent, name, text, kind) {
   const made = document.createElement(name);
   if (text !== undefined) made.textContent = text;
