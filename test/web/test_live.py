@@ -513,6 +513,8 @@ def test_each_loop_has_a_tab_and_every_one_that_runs_can_be_ended(tmp_path):
     with served([subject], lives=lives) as url, Chromium(tmp_path) as browser:
         tab = browser.tab(url)
         tab.wait("document.querySelectorAll('#loops button').length === 2")
+        # The models come behind the loops.
+        tab.wait("document.querySelector('#name').innerText !== 'connecting'")
         assert tab.text("#name") == "/tank/relay_node"
         assert not tab.text("#gains")
         # gains of another loop are not offered, and a plan makes way for a tune
