@@ -146,15 +146,14 @@ def analyse(
     if not alone:
         tell("comparing methods")
     models = [chosen.model, *([] if alone else _others(chosen, task))]
-    rules = (rule,) if alone else _first(rule)
     simple = next((m.model for m in models if m.structure == FOPDT.name), None)
     if alone:
-        simple = chosen.simple(known, rules)
+        simple = chosen.simple(task)
     tell("judging the model")
     record = chosen.record
     found = Analysis(record, assess(models, record))
     settled = bool(found.cycles) and limit_cycle(found.cycles).converged
-    return _judged(found, (record,), task, rules, simple, rng, tell, settled=settled)
+    return _judged(found, (record,), task, simple, rng, tell, alone=alone, settled=settled)
 
 
 def model_so_far(record: Record, task: Task | None = None, *, predicts: bool = False) -> Analysis:
@@ -170,12 +169,11 @@ def model_so_far(record: Record, task: Task | None = None, *, predicts: bool = F
     chosen = _chosen_so_far(record, task)
     if isinstance(chosen, Analysis):
         return chosen
+    found = Analysis(chosen.record, (chosen.model,))
     if not predicts:
-        return chosen.alone
-    simple = chosen.simple(task.known, (task.rule,))
-    designed = task_of_record(chosen.model, chosen.record, task.options, simple)
-    predicted = predicted_ms(designed, rule_named(task.rule))
-    return replace(chosen.alone, predicted=predicted)
+        return found
+    designed = task_of_record(chosen.model, chosen.record, task.options, chosen.simple(task))
+    return replace(found, predicted=predicted_ms(designed, rule_named(task.rule)))
 
 
 class RunningFit:
@@ -233,11 +231,6 @@ class _Chosen:
         """The record."""
         return self.records[0]
 
-    @property
-    def alone(self) -> Analysis:
-        """The analysis with this model only."""
-        return Analysis(self.record, (self.model,))
-
     def fopdt(self, known: Known) -> Identification | None:
         """Return the best FOPDT by the default method; None: there is none.
 
@@ -253,15 +246,16 @@ class _Chosen:
             return _guarded(DEFAULT_METHOD, fit)
         return None
 
-    def simple(self, known: Known, rules: Sequence[str]) -> TransferFunction | None:
+    def simple(self, task: Task, *, alone: bool = True) -> TransferFunction | None:
         """Return the FOPDT that most rules need; None: these do not, or there is none.
 
-        :param known: known values of the process.
-        :param rules: names of the rules.
+        :param task: what is known, and the rule.
+        :param alone: whether no other rule gives gains.
         """
         if self.model.structure == FOPDT.name:
             return self.model.model
-        fopdt = None if tuple(rules) == (DEFAULT_RULE,) else self.fopdt(known)
+        needed = not alone or task.rule != DEFAULT_RULE
+        fopdt = self.fopdt(task.known) if needed else None
         return None if fopdt is None else fopdt.model
 
 
@@ -344,28 +338,27 @@ def analyse_jointly(
     if told:
         chosen = replace(chosen, warnings=(*chosen.warnings, told))
     found = Analysis(first, assess((chosen,), first))
-    rules = _first(rule)
-    return _judged(found, records, task, rules, joint.simple(known, rules), rng)
+    return _judged(found, records, task, joint.simple(task, alone=False), rng)
 
 
 def _judged(
     found: Analysis,
     records: Sequence[Record],
     asked: Task,
-    rules: Sequence[str],
     simple: TransferFunction | None,
     rng: np.random.Generator | None,
     tell: Tell = _quiet,
     *,
+    alone: bool = False,
     settled: bool = False,
 ) -> Analysis:
     """Judge the model, add gains if they are allowed, and judge the gains.
 
     :param asked: what is known and asked.
-    :param rules: names of the rules, the one of the recommended gains first.
     :param simple: the FOPDT that most rules need; None: there is none.
     :param rng: draws the models within the uncertainty; None: of a fixed seed.
     :param tell: called with what begins.
+    :param alone: whether the other rules give no gains for comparison.
     """
     chosen, *others = found.models
     beside = difference(chosen, found.record)
@@ -386,7 +379,7 @@ def _judged(
     shaping = Shaping(task, evidence, findings)
     chosen = warned_of_rows(chosen, record, options)
     found = replace(found, models=(chosen, *others), shaping=shaping)
-    tuned = _tuned(found, task, rules)
+    tuned = _tuned(found, task, asked.rule, () if alone else tuple(RULES))
     gains = tuned.best_gains
     if gains is None:
         return replace(tuned, judgement=replace(judgement, refused=tuned.reason))
@@ -401,22 +394,16 @@ def _without_gains(found: Analysis, judgement: Judgement) -> Analysis:
     return replace(found, gains=(), judgement=judgement, reason=reason)
 
 
-def _first(rule: str) -> tuple[str, ...]:
-    """Return the names of all rules, the chosen one first."""
-    return (rule, *(name for name in RULES if name != rule))
-
-
-def _tuned(found: Analysis, task: DesignTask, rules: Sequence[str]) -> Analysis:
-    """Add the gains of the rules that apply to the selected model; the first rule must apply."""
+def _tuned(found: Analysis, task: DesignTask, rule: str, others: Sequence[str]) -> Analysis:
+    """Add the gains of a rule, and of others that apply to the selected model."""
     try:
-        first = design(task, rules[0])
+        gains = [design(task, rule)]
     except TuningError as error:
         return replace(found, reason=f"no gains: {error}")
-    gains = [first]
-    for name in rules[1:]:
+    for name in others:
         # A rule that does not apply is left out: it is only for comparison.
         with suppress(TuningError):
-            gains.append(design(task, name))
+            gains += [design(task, name)] if name != rule else []
     delay = task.options.added_delay
     return replace(found, gains=tuple(gains), added_delay=delay)
 
