@@ -114,16 +114,11 @@ def exported(gains: Gains, how: str, target: Target, *, doubt: str = "") -> str:
 
 
 def _file(gains: Gains, how: str, target: Target) -> str:
-    if how == "yaml":
-        return plain(gains, target)
-    if how == LAUNCH and gains.law in ("", OWN_LAW):
-        return launch_file(gains, target)
-    if how != (gains.law or OWN_LAW):
+    if how not in exports_of(gains.law):
         runs = gains.law or "controller_node, as a continuous controller"
         raise SelectionError(f"the gains are for {runs}: give --law {how} to export them for it")
-    if how == OWN_LAW:
-        return controller_file(gains, target)
-    return settings(gains, LAWS[how], target)
+    written = {"yaml": plain, LAUNCH: launch_file, OWN_LAW: controller_file}.get(how)
+    return written(gains, target) if written else settings(gains, LAWS[how], target)
 
 
 def exports_of(law: str) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 
 from relay_autotune.loop.analysis import as_run
 from relay_autotune.loop.gains import Controller, Gains, Performance
+from relay_autotune.quantities import result_fields
 from relay_autotune.report.case import Case
 from relay_autotune.text import date_text, digits, percent, span_text
 from relay_autotune.verdict import Finding, Result, Verdict
@@ -47,19 +48,16 @@ class CheckRow(NamedTuple):
     meaning: str
 
 
-# By what present gains are compared with new ones: names, fields, units and meanings.
-_NUMBERS = (("kc", "u/y"), ("ti", "s"), ("td", "s"), ("tf", "s"), ("b", ""))
+# By what present gains are compared with new ones: numbers; effects with labels and meanings.
+_NUMBERS = ("kc", "ti", "td", "tf", "b")
 _EFFECTS = (
-    ("Ms", "ms", "", "below 1.4 careful, above 2 risky"),
-    (
-        "error after a load step",
-        "iae_load",
-        "y s/u",
-        "the smaller, the sooner it is over",
-    ),
-    ("overshoot", "overshoot", "", "after a step of the set-point"),
-    ("settling time (2 %)", "settling_time", "s", "after a step of the set-point"),
+    ("Ms", "ms", "below 1.4 careful, above 2 risky"),
+    ("error after a load step", "iae_load", "the smaller, the sooner it is over"),
+    ("overshoot", "overshoot", "after a step of the set-point"),
+    ("settling time (2 %)", "settling_time", "after a step of the set-point"),
 )
+UNITS = {each.name: each.unit for each in result_fields(Gains)}
+"""Units of gains and of what they do, by their names."""
 
 
 class Compared(NamedTuple):
@@ -144,12 +142,12 @@ def compared(
         return f"{100.0 * value:.0f} %" if name == "overshoot" else digits(value, 3)
 
     numbers = [
-        (name, unit, *(digits(getattr(each, name)) if each else "none" for each, _ in both))
-        for name, unit in _NUMBERS
+        (name, UNITS[name], *(digits(getattr(g, name)) if g else "none" for g, _ in both))
+        for name in _NUMBERS
     ]
     effects = [
-        (label, unit, *(effect(*each, name) for each in both), meaning)
-        for label, name, unit, meaning in _EFFECTS
+        (label, UNITS[name], *(effect(*each, name) for each in both), meaning)
+        for label, name, meaning in _EFFECTS
     ]
     jumps = (digits(as_run(each, new).jump, 3) if each else "-" for each, _ in both)
     jump = ("jump of the command", "u/y", *jumps, "at once, by a unit step of the set-point")

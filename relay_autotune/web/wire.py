@@ -23,6 +23,7 @@ from relay_autotune.process.transfer_function import process_text
 from relay_autotune.record.record import Record
 from relay_autotune.report.case import Case, EstimatedQuantity, parameters_of, ultimate_of
 from relay_autotune.report.findings import (
+    UNITS,
     checks_of,
     compared,
     facts_of,
@@ -40,6 +41,14 @@ from relay_autotune.web.shape import CALM, FAST, STEP, DesignRequest, DesignResu
 _MOST_SIMULATED = 2000
 # Significant digits of a curve relative to its largest value: finer than a pixel.
 _DIGITS = 4
+# The numbers of the ISA form, with their meanings.
+_ISA = {
+    "kc": "proportional gain",
+    "ti": "integral time",
+    "td": "derivative time",
+    "tf": "filter of the measurement",
+    "b": "weight of the set-point",
+}
 
 
 def to_text(document: dict[str, Any]) -> str:
@@ -161,14 +170,6 @@ def of_shaped(subject: PageModel, shaped: DesignResult) -> dict[str, Any]:
     :param shaped: the gains.
     """
     case, gains, steps = subject.case_with(shaped), shaped.gains, shaped.steps
-    parallel = [("p", gains.p, "u/y"), ("i", gains.i, "u/(y s)"), ("d", gains.d, "u s/y")]
-    isa = [
-        ("kc", gains.kc, "u/y", "proportional gain"),
-        ("ti", gains.ti, "s", "integral time"),
-        ("td", gains.td, "s", "derivative time"),
-        ("tf", gains.tf, "s", "filter of the measurement"),
-        ("b", gains.b, "", "weight of the set-point"),
-    ]
     notes = [visible(text) for text in warnings_of(case)]
     if shaped.unstable:
         count = len(subject.shaping.task.models) if subject.shaping is not None else 0
@@ -182,8 +183,8 @@ def of_shaped(subject: PageModel, shaped: DesignResult) -> dict[str, Any]:
         "doubtful": visible(shaped.judgement.reason),
         "warnings": notes,
         "remarks": [visible(text) for text in remarks_of(case)],
-        "isa": [[n, digits(v), unit, meaning] for n, v, unit, meaning in isa],
-        "parallel": [[n, digits(v), unit] for n, v, unit in parallel],
+        "isa": [[n, digits(getattr(gains, n)), UNITS[n], what] for n, what in _ISA.items()],
+        "parallel": [[n, digits(getattr(gains, n)), UNITS[n]] for n in ("p", "i", "d")],
         "effects": _effects(shaped),
         "beside": [row.new for row in compared(None, None, gains)],
         "at": short(np.array([gains.ms, gains.iae_load])),
