@@ -97,21 +97,36 @@ def test_all_draws_are_had_beside_a_load_and_a_zero_that_a_dead_time_cancels(noi
     assert len(found.draws) >= 90
 
 
-def controlled(load):
-    """Record a step of the set-point, and later one of the load, under a PI controller."""
-    samples, interval, parts = 800, 2.0, 8
-    rng, step = np.random.default_rng(2), interval / parts
-    lags, late = (120.0, 25.0, 8.0), round(6.0 / step)
-    states, commands, integral = [0.0, 0.0, 0.0], [0.0] * (late + 1), 0.0
+def controlled(
+    load,
+    *,
+    lags=(120.0, 25.0, 8.0),
+    late=6.0,
+    kc=1.0,
+    times=(80.0, 200.0, 900.0),
+    samples=800,
+    noise_std=0.1,
+    seed=2,
+):
+    """Record a step of the set-point, and later one of the load, under a PI controller.
+
+    :param times: the controller's ti, and when the two steps come [s].
+    """
+    interval, parts = 2.0, 8
+    ti, moved, loaded = times
+    rng, step = np.random.default_rng(seed), interval / parts
+    states, integral = [0.0] * len(lags), 0.0
+    commands = [0.0] * (round(late / step) + 1)
+    delayed = len(commands)
     y, u = np.zeros(samples), np.zeros(samples)
     for k in range(samples):
-        y[k] = states[-1] + rng.normal(0.0, 0.1)
-        error = (20.0 if k >= 100 else 0.0) - y[k]
-        integral += error * interval / 80.0
-        u[k] = error + integral
+        y[k] = states[-1] + rng.normal(0.0, noise_std)
+        error = (20.0 if k * interval >= moved else 0.0) - y[k]
+        integral += error * interval / ti
+        u[k] = kc * (error + integral)
         for _ in range(parts):
             commands.append(float(u[k]))
-            into = 3.0 * (commands[-1 - late] + (load if k >= 450 else 0.0))
+            into = 3.0 * (commands[-delayed] + (load if k * interval >= loaded else 0.0))
             for i, lag in enumerate(lags):
                 states[i] += step * (into - states[i]) / lag
                 into = states[i]
@@ -127,3 +142,14 @@ def test_a_load_under_a_controller_does_not_change_the_model(load):
     assert sum(t.real for t in found.model.time_constants) + found.model.dead_time == (
         pytest.approx(159.0, rel=0.05)
     )
+
+
+def test_a_load_is_found_beside_white_noise_that_looks_coloured_by_chance():
+    """Of white residuals, too, some are given a colour: that is no slow disturbance."""
+    record = controlled(
+        -3.0, lags=(60.0, 20.0), late=8.0, kc=0.5, times=(60.0, 80.0, 220.0),
+        samples=300, noise_std=0.3, seed=1,
+    )  # fmt: skip
+    found = identify(record, "waveform")
+    assert found.loaded
+    assert found.model.gain == pytest.approx(3.0, rel=0.05)

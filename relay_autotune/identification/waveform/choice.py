@@ -355,12 +355,13 @@ def _with_a_load(
     if not loaded:
         return found
     decided = _with_best_terms(context, [min(loaded, key=lambda c: c.score)])
-    if _colour(decided.problem, decided.state) is not None:
+    if ljung_box(decided.state.residual) < _CHANCE:
         return found
     again = _with_terms(context, known, names, decided, loaded)
-    if not again or again[0].problem.colour is not None or again[0].score >= found[0].score:
+    if not again or again[0].score >= found[0].score:
         return found
-    return again if ljung_box(again[0].state.residual) >= _CHANCE else found
+    white = context.refit(again[0], None)
+    return found if white is None or ljung_box(white.state.residual) < _CHANCE else again
 
 
 def _with_terms(
