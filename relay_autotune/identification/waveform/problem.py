@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -227,8 +227,7 @@ class Problem:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return one experiment's columns with their derivatives, and its straight line."""
         time = self.time[part]
-        inputs = (self.inputs[number], *self.further_inputs(number))
-        first, *further = columns_of(self.structure, theta, time, inputs)
+        first, *further = columns_of(self.structure, theta, time, self.delayed[number])
         blocks = [first]
         if self.relaxation or self.structure.unstable:
             growing_only = not self.relaxation
@@ -247,22 +246,27 @@ class Problem:
         columns = np.concatenate([b[0] for b in blocks])
         return columns, np.concatenate([b[1] for b in blocks], axis=1), rest
 
-    def further_inputs(self, number: int) -> list[PiecewiseConstant]:
-        """Return the inputs beside the command whose responses have the model's dead time.
+    @cached_property
+    def delayed(self) -> list[tuple[Input, ...]]:
+        """The inputs whose responses have the model's dead time, of each experiment.
 
-        :param number: of the experiment.
+        They are the command, then those of `_further` but friction.
         """
-        found = []
+        return [
+            (u, *self._beside(u, part))
+            for u, part in zip(self.inputs, self.experiments, strict=True)
+        ]
+
+    def _beside(self, u: Input, part: slice) -> Iterator[PiecewiseConstant]:
         if self.past:
             # The level before is that of a step at the first sample, with the same response.
-            found.append(pulse(float(self.time[self.experiments[number]][0])))
+            yield pulse(float(self.time[part][0]))
         if self.unequal:
-            found.append(_folded(self.inputs[number]))
+            yield _folded(u)
         if self.play:
-            found.append(_turns(self.inputs[number]))
+            yield _turns(u)
         if self.load is not None:
-            found += [pulse(self.load, length) for length in (math.inf, self.shortest)]
-        return found
+            yield from (pulse(self.load, length) for length in (math.inf, self.shortest))
 
     def line(self, time: FloatArray) -> FloatArray:
         """Return the offset and, where estimated, the drift of one experiment, shape (1 or 2, n).

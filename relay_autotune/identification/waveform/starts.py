@@ -289,13 +289,12 @@ def _costs(
     """
     theta = np.array((math.log(tau), 0.0))
     along, power, total = (np.zeros(dead_times.size) for _ in range(3))
-    for number, (part, u) in enumerate(zip(problem.experiments, problem.inputs, strict=True)):
+    for part, inputs in zip(problem.experiments, problem.delayed, strict=True):
         time, y = problem.time[part], problem.y[part]
         # A dead time only shifts a response: one pass over shifted samples gives all rows.
         moved = time - dead_times[:, None]
         response, *shifted = (
-            shifted_columns(problem.structure, theta, moved, each)[0]
-            for each in (u, *problem.further_inputs(number))
+            shifted_columns(problem.structure, theta, moved, each)[0] for each in inputs
         )
         fixed = problem.line(time)
         if problem.relaxation:
