@@ -277,14 +277,21 @@ class FitContext:
             # It acts against the motion of a position.
             return []
         if terms == ("load",):
-            problem, state = with_load(candidate.problem, candidate.state)
-        else:
-            changed: dict[str, Any] = dict.fromkeys(terms, True)
-            problem = replace(candidate.problem, **changed)
-            state = _refined(problem, candidate.state)
-            if not _BEFORE.isdisjoint(terms):
-                state = self._out_of_a_wrong_minimum(problem, state)
+            return self.loaded(candidate)
+        changed: dict[str, Any] = dict.fromkeys(terms, True)
+        problem = replace(candidate.problem, **changed)
+        state = _refined(problem, candidate.state)
+        if not _BEFORE.isdisjoint(terms):
+            state = self._out_of_a_wrong_minimum(problem, state)
         other = self.candidate(problem, state)
+        return [] if other is None else [other]
+
+    def loaded(self, candidate: Candidate) -> list[Candidate]:
+        """Return a candidate with a step of the load, another one in place of its own; or none.
+
+        :param candidate: in white noise.
+        """
+        other = self.candidate(*with_load(replace(candidate.problem, load=None), candidate.state))
         return [] if other is None else [other]
 
     def _out_of_a_wrong_minimum(self, problem: Problem, state: Trial) -> Trial:

@@ -321,9 +321,7 @@ def _compared(
         return []
     decided = _with_best_terms(context, simple)
     found = _with_terms(context, known, names, decided, simple)
-    if not found or found[0].problem.colour is None:
-        return found
-    if context.loads or len(context.problem.bounds) > 1:
+    if not found or context.loads or len(context.problem.bounds) > 1:
         return found
     return _with_a_load(replace(context, loads=True), known, names, found, simple)
 
@@ -335,10 +333,10 @@ def _with_a_load(
     found: list[Candidate],
     simple: Sequence[Candidate],
 ) -> list[Candidate]:
-    """Return structures beside a step of the load, those without one where that explains less.
+    """Return structures beside a step of the load and those without one, the best first.
 
-    Where no relay held the process, a load counts only if white noise is all that is left:
-    between a few steps, a slow disturbance looks like a load as well.
+    A load counts only if a simple structure beside it explains more than all without one, and
+    white noise is all that is left: between a few steps, a slow disturbance looks like a load.
 
     :param context: the samples; a load may be estimated.
     :param known: the structure, if it is known.
@@ -347,21 +345,26 @@ def _with_a_load(
     :param simple: some of them in white noise, without any terms.
     """
     best = context.refit(found[0], None)
-    loaded = [
-        each
-        for without in (*simple, *([] if best is None else [best]))
-        for each in context.with_terms(without, ("load",))
-    ]
-    if not loaded:
+    starts = [*simple, *([] if best is None else [best])]
+    loaded = [each for without in starts for each in context.loaded(without)]
+    if loaded:
+        # From a lag alone, the others find their way out of a minimum without a load.
+        inside = context.with_nuisances_of(min(loaded, key=lambda c: c.score))
+        some = inside.fit([c.structure.name for c in simple], known.order)
+        loaded += [each for rough in some for each in context.loaded(rough)]
+    better = [c for c in loaded if c.score < found[0].score and _is_white(c)]
+    if not better:
         return found
-    decided = _with_best_terms(context, [min(loaded, key=lambda c: c.score)])
-    if ljung_box(decided.state.residual) < _CHANCE:
+    again = _with_terms(context, known, names, min(better, key=lambda c: c.score), loaded)
+    white = context.refit(again[0], None) if again else None
+    if white is None or not _is_white(white):
         return found
-    again = _with_terms(context, known, names, decided, loaded)
-    if not again or again[0].score >= found[0].score:
-        return found
-    white = context.refit(again[0], None)
-    return found if white is None or ljung_box(white.state.residual) < _CHANCE else again
+    return sorted(_near([*again, *found]), key=lambda c: c.score)
+
+
+def _is_white(candidate: Candidate) -> bool:
+    """Return whether white noise leaves what a candidate leaves, fitted in white noise."""
+    return ljung_box(candidate.state.residual) >= _CHANCE
 
 
 def _with_terms(
