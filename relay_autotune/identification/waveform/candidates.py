@@ -37,6 +37,7 @@ from relay_autotune.identification.waveform.starts import (
     Guess,
     best_of,
     coarse,
+    is_controlled,
     is_unobservable,
     latest_dead_times,
     longest_push,
@@ -188,6 +189,12 @@ class FitContext:
         if not isinstance(u, PiecewiseConstant):
             return math.inf
         return _LEAST_FRICTION * float(np.ptp(u.levels))
+
+    @cached_property
+    def bounded(self) -> bool:
+        """True if a relay or a controller held the process, so that it may grow by itself."""
+        parts = zip(self.problem.experiments, self.problem.inputs, strict=True)
+        return self.held or all(is_controlled(self.problem.time[part], u) for part, u in parts)
 
     @cached_property
     def pushed(self) -> float:

@@ -308,8 +308,8 @@ def _compared(
 
     The terms are decided with a few simple structures.
     """
-    # What runs away by itself is not recorded, except where a relay held it.
-    names = [n for n in among if context.held or not TABLE[n].unstable]
+    # What runs away by itself is not recorded, except where a relay or a controller held it.
+    names = [n for n in among if context.bounded or not TABLE[n].unstable]
     first = [*SIMPLE, *[INTEGRATOR_LAG.name] * bool(context.problem.motions)]
     if known.structure:
         names = first = [known.structure]

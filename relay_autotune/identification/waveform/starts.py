@@ -150,6 +150,15 @@ _SHARES = (
 )
 
 
+def is_controlled(time: FloatArray, u: Input) -> bool:
+    """Return whether a command moves a little at most samples, as a controller's does.
+
+    :param time: of the samples [s], shape (n,).
+    :param u: the command.
+    """
+    return changes_within(u, time).size > _MOST_SWITCHES * time.size
+
+
 def time_scales(problem: Problem) -> tuple[float, float]:
     """Return the shortest time that samples resolve, and the longest possible dead time [s].
 
@@ -162,8 +171,8 @@ def time_scales(problem: Problem) -> tuple[float, float]:
         shortest = float(np.median(gaps[gaps > 0.0]))
         inside = changes_within(u, time)
         rest = answering_time(time, u)
-        if inside.size > _MOST_SWITCHES * time.size and isinstance(u, PiecewiseConstant):
-            # A controller moves a little at each sample, and far when its set-point is switched.
+        if isinstance(u, PiecewiseConstant) and is_controlled(time, u):
+            # It moves far when its set-point is switched.
             steps = np.abs(np.diff(u.levels))
             large = u.times[steps >= _SWITCH * float(np.ptp(u.values))]
             inside = large[(large >= time[0]) & (large < time[-1])]
