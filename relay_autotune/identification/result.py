@@ -213,8 +213,10 @@ class Identification:
     # model [y], shape (n,); NaN: not part of the fit; empty: not computed. It is as long as the
     # record, and so in no document or message.
     fitted: FloatArray = field(default_factory=lambda: np.empty(0))
-    # How strongly commands above and below the first one act, relative to the model.
+    # How strongly commands above and below one act, relative to the model, and that one [u]; NaN:
+    # all act alike.
     effects: tuple[float, float] = (1.0, 1.0)
+    middle: float = math.nan
     # True: the process was not at rest at the relay's baseline when the test began.
     began_away: bool = False
     # True: a step of the load was estimated with the model.
@@ -240,15 +242,15 @@ class Identification:
         """The transfer function."""
         return self.estimate.model
 
-    def felt(self, command: FloatArray, first: float) -> FloatArray:
+    def felt(self, command: FloatArray) -> FloatArray:
         """Return commands as the model feels them, whose effects above and below one may differ.
 
         :param command: u, shape (n,).
-        :param first: the first command of the record [u].
         """
-        away = command - first
-        above, below = self.effects
-        return np.asarray(first + np.where(away > 0.0, above, below) * away)
+        if math.isnan(self.middle):
+            return command
+        away = command - self.middle
+        return np.asarray(self.middle + np.where(away > 0.0, *self.effects) * away)
 
     @property
     def why_chosen(self) -> str:

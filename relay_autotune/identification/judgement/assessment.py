@@ -311,15 +311,16 @@ def _validated(found: Identification, seen: Fold | None, record: Record) -> Vali
         return None
     try:
         rest = steady_state(record, seen.settings)
-        felt = _felt(seen.settings, found, record.input().initial)
-        return validate_fold(found.model, replace(seen, settings=felt), rest)
+        return validate_fold(
+            found.model, replace(seen, settings=_felt(seen.settings, found)), rest
+        )
     except IdentificationError as error:
         return Validation(reason=str(error))
 
 
-def _felt(settings: RelaySettings, found: Identification, first: float) -> RelaySettings:
+def _felt(settings: RelaySettings, found: Identification) -> RelaySettings:
     """Return the relay whose equal effects are those that a process feels of one."""
-    low, high = found.felt(np.array([settings.low, settings.high]), first).tolist()
+    low, high = found.felt(np.array([settings.low, settings.high])).tolist()
     bias = 0.5 * (high + low) - settings.baseline
     # Each of its moves crosses the play.
     return replace(settings, amplitude=0.5 * (high - low - found.play), bias=bias)

@@ -147,7 +147,7 @@ def _left_out(evidence: Evidence) -> Measured:
 
 def _clipped(evidence: Evidence) -> Measured:
     weak, strong = sorted(evidence.found.effects)
-    return Measured(1.0 - weak / strong, f"{evidence.record.input().initial:.4g}")
+    return Measured(1.0 - weak / strong, f"{evidence.found.middle:.4g}")
 
 
 MODEL_CHECKS = (
@@ -239,7 +239,7 @@ MODEL_CHECKS = (
     Check(
         name="clipped",
         title="Clipping",
-        what="share of their effect that commands lose on one side of the first one",
+        what="share of their effect that commands lose on one side of their middle",
         unit="",
         doubtful=0.6,
         sentence="commands on one side of {detail} lose {value} of the effect that those on the "

@@ -344,7 +344,7 @@ class FitContext:
             "drift": True,
             "relaxation": not rested,
             "past": not rested and self.problem.past_is_open,
-            "unequal": self.problem.acts_both_ways,
+            "unequal": self.problem.shows_its_curve,
             "play": self.problem.most_play(held=self.held) >= self.least_friction,
             "load": self.loads and len(self.problem.bounds) == 1,
             "friction": self.held and bool(self.problem.motions),

@@ -34,7 +34,7 @@ from relay_autotune.identification.waveform.fit_covariance import (
     raw_residual,
 )
 from relay_autotune.identification.waveform.posterior import posterior
-from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem
+from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem, middle_of
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.separable import (
@@ -114,6 +114,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         draws=allowed.models,
         parts=allowed.parts,
         effects=problem.effects(state.coefficients),
+        middle=middle_of(problem.inputs[0]) if problem.unequal else math.nan,
         began_away=_began_away(records, fit),
         loaded=problem.load is not None,
         play=problem.play_of(state.coefficients),
@@ -288,8 +289,9 @@ def _warnings(
     effects = fit.problem.effects(fit.state.coefficients)
     above, below = (f"{effect:.2f}" for effect in effects)
     if above != below and not abs(effects[0] - 1.0) <= known_to:
+        middle = middle_of(fit.problem.inputs[0])
         found.append(
-            f"commands above the first one act {above} times as strongly as in the model, "
+            f"commands above {middle:.4g} u act {above} times as strongly as in the model, "
             f"those below it {below} times: the process is not linear, and the gains hold on "
             "both sides; the weaker direction sets how fast the loop can be"
         )

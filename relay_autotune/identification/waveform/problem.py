@@ -91,16 +91,13 @@ class Problem:
         return float(np.median(gaps[gaps > 0.0]))
 
     @property
-    def acts_both_ways(self) -> bool:
-        """True if each command moves to both sides of its first level, and stays there, too.
+    def shows_its_curve(self) -> bool:
+        """True if each command stays at more than two levels.
 
-        Of two levels alone, the distance from a third one is the command itself.
+        Of two alone, the distance from a third one is the command itself.
         """
         return all(
-            isinstance(u, PiecewiseConstant)
-            and bool(u.values.size)
-            and float(u.values.min()) < u.initial < float(u.values.max())
-            and np.unique(u(self.time[part])).size > 2
+            isinstance(u, PiecewiseConstant) and np.unique(u(self.time[part])).size > 2
             for u, part in zip(self.inputs, self.experiments, strict=True)
         )
 
@@ -150,7 +147,7 @@ class Problem:
         return float(coefficients[self.places(term)[0]] / coefficients[0])
 
     def effects(self, coefficients: FloatArray) -> tuple[float, float]:
-        """Return how strongly commands above and below the first one act, relative to the model.
+        """Return how strongly commands above and below their middle act, relative to the model.
 
         :param coefficients: of a fit, shape (k,).
         """
@@ -252,10 +249,8 @@ class Problem:
 
         They are the command, then those of `_further` but friction.
         """
-        return [
-            (u, *self._beside(u, part))
-            for u, part in zip(self.inputs, self.experiments, strict=True)
-        ]
+        each = zip(self.inputs, self.experiments, strict=True)
+        return [(u, *self._beside(u, part)) for u, part in each]
 
     def _beside(self, u: Input, part: slice) -> Iterator[PiecewiseConstant]:
         if self.past:
@@ -332,10 +327,21 @@ def pulse(begin: float = 0.0, length: float = math.inf) -> PiecewiseConstant:
     return PiecewiseConstant(np.array([begin, begin + length]), np.array([1.0, 0.0]), 0.0)
 
 
-def _folded(u: Input) -> PiecewiseConstant:
-    """Return the distance of a held command from its first level."""
+def middle_of(u: Input) -> float:
+    """Return the command above and below which effects may differ [u].
+
+    It is the first one, or half the range where the command stays on one side of that.
+    """
     assert isinstance(u, PiecewiseConstant)
-    return PiecewiseConstant(u.times, np.abs(u.values - u.initial), 0.0)
+    low, high = float(u.values.min()), float(u.values.max())
+    return u.initial if low < u.initial < high else 0.5 * (low + high)
+
+
+def _folded(u: Input) -> PiecewiseConstant:
+    """Return how much farther from its middle a held command is than at first."""
+    assert isinstance(u, PiecewiseConstant)
+    far = np.abs(u.levels - middle_of(u))
+    return PiecewiseConstant(u.times, far[1:] - far[0], 0.0)
 
 
 def _turns(u: Input) -> PiecewiseConstant:
