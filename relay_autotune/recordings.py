@@ -192,7 +192,7 @@ def _taken_apart(record: Record, *, whole: bool) -> tuple[list[Record], list[str
     :param whole: whether it is one experiment, whatever it looks like.
     :raises BagError: if nothing stands out of the noise.
     """
-    from relay_autotune.record.excitation import find_experiments
+    from relay_autotune.record.excitation import find_experiments, gaps_of
 
     missing = _missing_rows(record)
     if whole or len(record) < _FEWEST_SAMPLES:
@@ -209,7 +209,10 @@ def _taken_apart(record: Record, *, whole: bool) -> tuple[list[Record], list[str
             "a wrong model; record an experiment, or name a part to be used all the same with "
             "--start and --end"
         )
-    records = [record.part(stretch.first, stretch.last + 1) for stretch in stretches]
+    gaps = gaps_of(record)
+    records = [
+        record.part(each.first, each.last + 1, gaps.known_from(each.first)) for each in stretches
+    ]
     if len(stretches) == 1 and len(records[0]) == len(record):
         return records, missing
     begins = record.time[[stretch.first for stretch in stretches]]
@@ -479,9 +482,9 @@ def window(record: Record, start: float | None, end: float | None) -> list[Recor
             f"no sample lies between --start {0.0 if start is None else start:g} s and "
             f"--end {time[-1] if end is None else end:g} s; the recording is {time[-1]:g} s long"
         )
-    hidden = gaps_of(record).hidden
-    ends = [low, *hidden[(hidden > low) & (hidden < high)].tolist(), high]
-    pieces = [record.part(a, b) for a, b in pairwise(ends)]
+    gaps = gaps_of(record)
+    ends = [low, *gaps.hidden[(gaps.hidden > low) & (gaps.hidden < high)].tolist(), high]
+    pieces = [record.part(a, b, gaps.known_from(a)) for a, b in pairwise(ends)]
     long = [piece for piece in pieces if len(piece) >= _FEWEST_SAMPLES] or pieces[:1]
     return [piece for piece in long if np.ptp(piece.command) > 0.0] or long[:1]
 

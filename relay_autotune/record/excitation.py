@@ -110,6 +110,10 @@ class Gaps:
     longest: float
     hidden: IntArray
 
+    def known_from(self, sample: int) -> int:
+        """Return the first sample from which the command is known without a break to another."""
+        return int(self.hidden[self.hidden <= sample].max(initial=0))
+
 
 @cached_on_record
 def gaps_of(record: Record) -> Gaps:

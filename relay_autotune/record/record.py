@@ -447,13 +447,14 @@ class Record:
         """The noise measured before the test, or else estimated from second differences [y]."""
         return self.noise_std if math.isfinite(self.noise_std) else roughness(self.measurement)
 
-    def part(self, low: int, high: int) -> Record:
+    def part(self, low: int, high: int, known: int = 0) -> Record:
         """Return some of the samples; the command's history is kept.
 
         Without what came before, the process would seem to begin at rest.
 
         :param low: index of the first sample to keep.
         :param high: index of the first one after it not to keep.
+        :param known: index of the sample before which the command is not known.
         """
         if low == 0 and high == len(self):
             return self
@@ -461,6 +462,11 @@ class Record:
         held = self.held_input
         if low > 0 or held is not None:
             whole = self.input()
+            if known:
+                past = int(np.searchsorted(whole.times, self.time[known], side="right"))
+                whole = PiecewiseConstant(
+                    whole.times[past:], whole.values[past:], float(whole.levels[past])
+                )
             held = PiecewiseConstant(whole.times - origin, whole.values, whole.initial)
         kept = slice(low, high)
         return replace(

@@ -378,6 +378,9 @@ def test_a_named_part_is_apart_at_a_gap_in_which_the_command_changed(tmp_path):
     path = write(tmp_path / "a.csv", text)
     found = read_experiments(path, Selection(start=0.0))
     assert [len(record) for record in found.experiments] == [34, 55]
+    # What was commanded before acts after the gap as little as what nobody knows of it.
+    after = found.experiments[1].input()
+    assert (after.initial, after.times.tolist()) == (0.0, [25.0])
     assert "an experiment ends there" in found.notes[0]
     # Without a move that is known nothing is left to learn from.
     (before,) = read_experiments(path, Selection(start=0.0, end=60.0)).experiments
