@@ -59,6 +59,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     :param fit: the fit.
     :raises IdentificationError: if the fit left its structure.
     """
+    fit = _levelled(fit)
     problem, state, scale = fit.problem, fit.state, fit.scale
     n = problem.time.size
     residual = raw_residual(problem, state)
@@ -130,6 +131,22 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         )
         found = replace(found, warnings=(*found.warnings, told))
     return with_what_is_determined(found, records, allowed, quantile)
+
+
+def _levelled(fit: Fit) -> Fit:
+    """Return a fit with the offset and the drift with which it simulates the record best.
+
+    A colour near a random walk says next to nothing of either.
+    """
+    problem, state = fit.problem, fit.state
+    if problem.colour is None:
+        return fit
+    lines = len(problem.bounds) * (1 + problem.drift)
+    columns, _ = problem.columns(state.theta)
+    rows, left = columns[-lines:], problem.y - state.coefficients @ columns
+    coefficients = state.coefficients.copy()
+    coefficients[-lines:] += np.linalg.lstsq(rows.T, left, rcond=None)[0]
+    return replace(fit, state=replace(state, coefficients=coefficients))
 
 
 def point_stds(found: Identification, mixture: Sequence[TransferFunction]) -> tuple[float, float]:
