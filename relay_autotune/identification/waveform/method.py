@@ -49,7 +49,7 @@ from relay_autotune.identification.waveform.problem import (
 )
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import scale_of, weights
-from relay_autotune.identification.waveform.separable import TRIAL, Trial, refine
+from relay_autotune.identification.waveform.separable import TRIAL, Trial, evaluate, refine
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, TABLE
 from relay_autotune.record.excitation import at_its_ends, changes_within, smooth
@@ -272,7 +272,7 @@ def _spared_of_outliers(problem: Problem, fit: Fit, known: Known, chosen: Choose
         first, weight = _reweighted(problem, fit, known.loss, base), base.copy()
         weight[_places(problem, first.problem)] = first.problem.weight
         again = chosen(replace(problem, weight=weight))
-        return _reweighted(problem, again, known.loss, base)
+        return _counted(_reweighted(problem, again, known.loss, base))
     kept = _before_jump(problem, fit)
     if kept < problem.time.size:
         last = problem.time[kept]
@@ -309,6 +309,16 @@ def _reweighted(whole: Problem, fit: Fit, loss: str, base: FloatArray) -> Fit:
         if float(change.max()) <= TRIAL:
             break
     return replace(fit, problem=problem, state=state, base=own, loss=loss, plain=None)
+
+
+def _counted(fit: Fit) -> Fit:
+    """Return a fit without the samples of which its loss takes nothing."""
+    assert fit.problem.weight is not None and fit.base is not None
+    some = np.flatnonzero(fit.problem.weight)
+    problem = fit.problem.part(some)
+    return replace(
+        fit, problem=problem, state=evaluate(problem, fit.state.theta), base=fit.base[some]
+    )
 
 
 def _places(whole: Problem, part: Problem) -> NDArray[np.int64]:

@@ -285,7 +285,7 @@ class Problem:
         parts = [self.colour.whitened(rows[..., part]) for part in self.experiments]
         return np.concatenate(parts, axis=-1)
 
-    def part(self, chosen: NDArray[np.bool_] | slice) -> Problem:
+    def part(self, chosen: NDArray[np.bool_] | NDArray[np.int64] | slice) -> Problem:
         """Return the problem of some of the samples, of each experiment at least a few."""
         return replace(
             self,
