@@ -185,6 +185,13 @@ class TransferFunction:
         """True if a pole lies in the open right half plane; that of an integrator does not."""
         return any(t.real < 0.0 for t in self.time_constants)
 
+    def growth_in(self, time: float) -> float:
+        """Return a time in time constants of what grows fastest; 0 where nothing does.
+
+        :param time: s.
+        """
+        return max((time / -t.real for t in self.time_constants if t.real < 0.0), default=0.0)
+
     @property
     def numerator(self) -> tuple[float, ...]:
         """Coefficients of powers of s, highest first, without the dead time."""

@@ -63,6 +63,9 @@ _FAR = 0.5
 _ENOUGH_REST = 15
 _STILL, _STILL_LATER = 0.05, 0.5
 
+# Number of time constants within which an unstable process leaves any rest.
+MOST_GROWTH = 7.0
+
 
 @dataclass(frozen=True)
 class Stretch:
@@ -143,6 +146,16 @@ def changes_within(u: Input, time: FloatArray) -> FloatArray:
     :param time: of the samples [s], shape (n,).
     """
     return np.asarray(u.times[(u.times >= time[0]) & (u.times < time[-1])])
+
+
+def longest_stay(time: FloatArray, u: Input) -> float:
+    """Return the longest time between samples for which an input stood still [s].
+
+    :param time: of the samples [s], shape (n,).
+    :param u: the input.
+    """
+    inside = u.times[(u.times > time[0]) & (u.times < time[-1])]
+    return float(np.max(np.diff(np.concatenate((time[:1], inside, time[-1:])))))
 
 
 def answering_time(time: FloatArray, u: Input) -> float:

@@ -7,19 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.identification.judgement.difference import Difference
 from relay_autotune.identification.result import Identification
-from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.excitation import changes_within
+from relay_autotune.record.excitation import changes_within, longest_stay
 from relay_autotune.record.record import Record
-
-# Number of time constants within which an unstable process leaves any rest.
-MOST_GROWTH = 7.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,17 +61,8 @@ class Evidence:
         begin = np.min(changes, initial=time[-1])
         return float(time[-1] - max(begin, time[0]))
 
-    def growth(self, model: TransferFunction) -> float:
-        """Return the longest time of a constant command in time constants of a model's growth.
-
-        :param model: any; 0 where it does not grow by itself.
-        """
-        growing = [-t.real for t in model.time_constants if t.real < 0.0]
-        return self.longest_stay / min(growing) if growing else 0.0
-
-    @cached_property
-    def longest_stay(self) -> float:
-        """Longest time within the record for which the command stood still [s]."""
-        time, changes = self.record.time, self.record.input().times
-        inside = changes[(changes > time[0]) & (changes < time[-1])]
-        return float(np.max(np.diff(np.concatenate((time[:1], inside, time[-1:])))))
+    @property
+    def growth(self) -> float:
+        """Longest time of a constant command in time constants of the model's growth."""
+        stay = longest_stay(self.record.time, self.record.input())
+        return self.found.model.growth_in(stay)

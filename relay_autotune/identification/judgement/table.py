@@ -18,8 +18,9 @@ from relay_autotune.identification.estimate import student_95
 from relay_autotune.identification.judgement.assessment import unexplained_share
 from relay_autotune.identification.judgement.checks import read_backward
 from relay_autotune.identification.judgement.difference import LEAST_SAMPLES
-from relay_autotune.identification.judgement.evidence import MOST_GROWTH, Evidence
+from relay_autotune.identification.judgement.evidence import Evidence
 from relay_autotune.record.cycles import limit_cycle
+from relay_autotune.record.excitation import MOST_GROWTH
 from relay_autotune.text import digits
 from relay_autotune.verdict import Check, Measured, not_known
 
@@ -74,8 +75,7 @@ def _limit_cycle(evidence: Evidence) -> Measured | None:
 
 
 def _growth(evidence: Evidence) -> Measured | None:
-    growth = evidence.growth(evidence.found.model)
-    return Measured(growth) if growth > 0.0 else None
+    return Measured(evidence.growth) if evidence.growth > 0.0 else None
 
 
 def _risk(evidence: Evidence) -> Measured | None:

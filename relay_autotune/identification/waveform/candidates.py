@@ -58,8 +58,13 @@ from relay_autotune.process.structures import (
     Structure,
 )
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.excitation import begins_at_rest, changes_within
-from relay_autotune.record.record import PiecewiseConstant
+from relay_autotune.record.excitation import (
+    MOST_GROWTH,
+    begins_at_rest,
+    changes_within,
+    longest_stay,
+)
+from relay_autotune.record.record import Input, PiecewiseConstant
 
 MOST_LAGS = 8
 _MOST_LAGS_WITH_ZERO = 4
@@ -193,16 +198,27 @@ class FitContext:
     @cached_property
     def bounded(self) -> bool:
         """True if a relay or a controller held the process, so that it may grow by itself."""
+        return self.held or all(is_controlled(time, u) for time, u in self._parts)
+
+    @cached_property
+    def most_growth(self) -> float:
+        """Fastest growth with which a process did not run away [1/s]; a relay shows it."""
+        if self.held:
+            return math.inf
+        return MOST_GROWTH / max(longest_stay(time, u) for time, u in self._parts)
+
+    @property
+    def _parts(self) -> list[tuple[FloatArray, Input]]:
+        """Sample times and input of each experiment."""
         parts = zip(self.problem.experiments, self.problem.inputs, strict=True)
-        return self.held or all(is_controlled(self.problem.time[part], u) for part, u in parts)
+        return [(self.problem.time[part], u) for part, u in parts]
 
     @cached_property
     def pushed(self) -> float:
         """Longest time for which the command acted in one direction [s]; infinite for a relay."""
         if self.sign:
             return math.inf
-        parts = zip(self.problem.experiments, self.problem.inputs, strict=True)
-        return max(longest_push(self.problem.time[part], u) for part, u in parts)
+        return max(longest_push(time, u) for time, u in self._parts)
 
     def candidate(self, problem: Problem, state: Trial) -> Candidate | None:
         """Return a fit as a candidate; None if it cannot be read as its structure.
@@ -222,6 +238,8 @@ class FitContext:
             if not any(-_LASTING * self.length < z.real < 0.0 for z in model.zeros):
                 return None
         elif model.dead_time > self.latest[model.process_sign > 0]:
+            return None
+        if model.growth_in(1.0) > self.most_growth:
             return None
         if min(problem.effects(state.coefficients)) < 0.0:
             # Commands may lose their effect on one side, but not act the other way there.
