@@ -333,7 +333,7 @@ def middle_of(u: Input) -> float:
     It is the first one, or half the range where the command stays on one side of that.
     """
     assert isinstance(u, PiecewiseConstant)
-    low, high = float(u.values.min()), float(u.values.max())
+    low, high = float(u.levels.min()), float(u.levels.max())
     return u.initial if low < u.initial < high else 0.5 * (low + high)
 
 

@@ -1,0 +1,59 @@
+# Copyright 2026 the developers of relay_autotune
+# SPDX-License-Identifier: Apache-2.0
+
+"""Processes that are not what a step test is made for: unstable ones, and those with a curve."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import odeint
+
+from relay_autotune.control.controller import PidController
+from relay_autotune.identification.methods import identify
+from relay_autotune.loop.gains import Controller
+from relay_autotune.process.structures import UNSTABLE_FOPDT
+from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
+from relay_autotune.record.record import Record
+
+
+@pytest.mark.parametrize(
+    ("gains", "moves"),
+    [
+        (Controller(4.0, 20.0), {5.0: 2.0, 40.0: 0.0}),
+        (Controller(3.0, 30.0), {5.0: 2.0, 60.0: -1.0}),
+    ],
+)
+def test_what_a_controller_keeps_from_running_away_is_no_integrator(gains, moves):
+    """It was given an integrator with a zero, and gains that make the loop unstable."""
+    process = UNSTABLE_FOPDT.build((1.0, 10.0, 1.0))
+    plant = VirtualProcess(process, disturbances=Disturbances(noise_std=0.02), seed=7)
+    controller, setpoint, rows = PidController(gains, 0.0), 0.0, []
+    for t in np.arange(0.0, 80.0, 0.2):
+        setpoint = next((y for at, y in moves.items() if 0.0 <= t - at < 0.2), setpoint)
+        y = plant.measure(t)
+        rows.append((t, y, controller.step(t, setpoint, y)))
+        plant.command(rows[-1][-1])
+    found = identify(Record(*np.array(rows).T))
+    assert found.model.structure == "unstable_fopdt"
+    assert found.model.gain == pytest.approx(process.gain, rel=0.02)
+
+
+def test_a_staircase_over_a_gain_that_grows_is_no_integrator():
+    """Each step answers more than the one before, as an integrator's would."""
+    rng = np.random.default_rng(5)
+    time = np.arange(900) * 1.0
+    command = np.clip(np.floor(time / 150.0), 0.0, 5.0)
+
+    def slope(y, t):
+        u = command[min(int(t), time.size - 1)]
+        return [(0.4 * u + 0.15 * u**2 - y[0]) / 12.0, (y[0] - y[1]) / 12.0]
+
+    y = odeint(slope, [0.0, 0.0], time, hmax=0.5)[:, 1] + 0.02 * rng.standard_normal(time.size)
+    found = identify(Record(time, y, command))
+    above, below = found.effects
+    assert found.middle == pytest.approx(2.5)
+    # The mean slopes of the curve on either side.
+    assert found.model.gain * above == pytest.approx(1.525, rel=0.1)
+    assert found.model.gain * below == pytest.approx(0.775, rel=0.15)
+    assert sum(t.real for t in found.model.time_constants) < 40.0
