@@ -52,6 +52,7 @@ UNTOLD = {
         for name in (
             "fitted",
             "effects",
+            "middle",
             "play",
             "friction",
             "began_away",
