@@ -195,10 +195,11 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
 
     :raises SelectionError: if options contradict each other, or a name is unknown.
     """
-    with_table, target = not (options.json or options.output), export_target(options)
+    with_table = not (options.json or options.output)
     recordings = _recordings(options.bags)
     jobs = jobs_of(options, recordings, table_width=width() if with_table else None)
     jobs = [replace(j, form=options.form, accept_doubtful=options.accept_doubtful) for j in jobs]
+    target = export_target(options)
     if with_table and len(jobs) > 1 and any(recordings_in(Path(name)) for name in options.bags):
         name_width = min(max(len(job.label) for job in jobs), _LONGEST_NAME)
         jobs = [replace(job, name_width=name_width) for job in jobs]
