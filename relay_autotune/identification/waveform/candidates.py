@@ -464,7 +464,10 @@ def _refined(problem: Problem, state: Trial) -> Trial:
 
 def nuisances_of(problem: Problem, terms: Iterable[str] = TERMS) -> tuple[bool, ...]:
     """Return which of some terms beside the model are estimated."""
-    return tuple(getattr(problem, term) not in (False, None) for term in terms)
+    # A load may come at 0 s, which is no False.
+    return tuple(
+        getattr(problem, t) is not False and getattr(problem, t) is not None for t in terms
+    )
 
 
 def as_in(other: Problem, problem: Problem) -> Problem:
@@ -508,7 +511,7 @@ def with_load(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
         if abs(shift) < problem.shortest:
             break
         load += min(max(shift, -farthest), farthest)
-        load = min(max(load, float(time[0])), float(time[-1]))
+        load = min(max(load, float(instants[0])), float(instants[-1]))
     return loaded, found
 
 

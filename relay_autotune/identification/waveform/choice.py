@@ -45,6 +45,7 @@ from relay_autotune.identification.waveform.separable import (
     left_in_simulation,
     refine,
 )
+from relay_autotune.identification.waveform.starts import large_changes
 from relay_autotune.process.structures import (
     FOPDT,
     INTEGRATOR_INVERSE,
@@ -61,6 +62,7 @@ from relay_autotune.process.structures import (
     UNSTABLE_SOPDT,
 )
 from relay_autotune.record.excitation import answering_time
+from relay_autotune.record.record import PiecewiseConstant
 
 # Order in which structures are fitted: first those that show which others are hopeless.
 TRIED = tuple(
@@ -355,14 +357,28 @@ def _with_a_load(
         inside = context.with_nuisances_of(min(loaded, key=lambda c: c.score))
         some = inside.fit([c.structure.name for c in simple], known.order)
         loaded += [each for rough in some for each in context.loaded(rough)]
-    better = [c for c in loaded if c.score < found[0].score and _is_white(c)]
+    better = [c for c in loaded if c.score < found[0].score and _is_white(c) and _is_apart(c)]
     if not better:
         return found
     again = _with_terms(context, known, names, min(better, key=lambda c: c.score), loaded)
-    white = context.refit(again[0], None) if again else None
-    if white is None or not _is_white(white):
+    white = [c for c in _in(None, again, context) if c.score < found[0].score]
+    if not white or not _is_white(white[0]):
         return found
-    return sorted(_near([*again, *found]), key=lambda c: c.score)
+    if not _is_apart(white[0]) or white[0].model.process_sign != found[0].model.process_sign:
+        return found
+    return sorted(_near([*white, *found]), key=lambda c: c.score)
+
+
+def _is_apart(candidate: Candidate) -> bool:
+    """Return whether a load comes a dead time apart from each large move of the command.
+
+    Nearer ones may stand for the answer to that.
+    """
+    u, load = candidate.problem.inputs[0], candidate.problem.load
+    if load is None or not isinstance(u, PiecewiseConstant):
+        return False
+    nearest = np.min(np.abs(large_changes(u) - load), initial=math.inf)
+    return bool(nearest > candidate.model.dead_time)
 
 
 def _is_white(candidate: Candidate) -> bool:

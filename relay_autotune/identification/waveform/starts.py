@@ -159,6 +159,14 @@ def is_controlled(time: FloatArray, u: Input) -> bool:
     return changes_within(u, time).size > _MOST_SWITCHES * time.size
 
 
+def large_changes(u: PiecewiseConstant) -> FloatArray:
+    """Return when a command moves far, as a controller's does when its set-point is switched [s].
+
+    :param u: the command.
+    """
+    return np.asarray(u.times[np.abs(np.diff(u.levels)) >= _SWITCH * float(np.ptp(u.values))])
+
+
 def time_scales(problem: Problem) -> tuple[float, float]:
     """Return the shortest time that samples resolve, and the longest possible dead time [s].
 
@@ -172,9 +180,7 @@ def time_scales(problem: Problem) -> tuple[float, float]:
         inside = changes_within(u, time)
         rest = answering_time(time, u)
         if isinstance(u, PiecewiseConstant) and is_controlled(time, u):
-            # It moves far when its set-point is switched.
-            steps = np.abs(np.diff(u.levels))
-            large = u.times[steps >= _SWITCH * float(np.ptp(u.values))]
+            large = large_changes(u)
             inside = large[(large >= time[0]) & (large < time[-1])]
         if inside.size >= 4:
             # In a relay test the process answers one switch before the next.
