@@ -362,9 +362,7 @@ def _with_a_load(
         return found
     again = _with_terms(context, known, names, min(better, key=lambda c: c.score), loaded)
     white = [c for c in _in(None, again, context) if c.score < found[0].score]
-    if not white or not _is_white(white[0]):
-        return found
-    if not _is_apart(white[0]) or white[0].model.process_sign != found[0].model.process_sign:
+    if not (white and _is_white(white[0]) and _is_apart(white[0])):
         return found
     return sorted(_near([*white, *found]), key=lambda c: c.score)
 
