@@ -16,7 +16,9 @@ from relay_autotune.analysis import model_so_far
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
-from relay_autotune.process.structures import structure_named
+from relay_autotune.identification.waveform.candidates import nuisances_of
+from relay_autotune.identification.waveform.problem import problem_of
+from relay_autotune.process.structures import FOPDT, structure_named
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record
 
@@ -142,6 +144,14 @@ def test_a_load_under_a_controller_does_not_change_the_model(load):
     assert sum(t.real for t in found.model.time_constants) + found.model.dead_time == (
         pytest.approx(159.0, rel=0.05)
     )
+
+
+def test_a_load_at_0_s_counts_as_one():
+    """It was taken for none, and added without end."""
+    time = np.arange(20.0)
+    problem = problem_of([(time, 0.0 * time, PiecewiseConstant([5.0], [1.0], 0.0))], FOPDT)
+    assert nuisances_of(problem, ("load",)) == (False,)
+    assert nuisances_of(replace(problem, load=0.0), ("load",)) == (True,)
 
 
 def test_a_load_is_found_beside_white_noise_that_looks_coloured_by_chance():
