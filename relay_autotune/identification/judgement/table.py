@@ -75,7 +75,8 @@ def _limit_cycle(evidence: Evidence) -> Measured | None:
 
 
 def _growth(evidence: Evidence) -> Measured | None:
-    return Measured(evidence.growth) if evidence.growth > 0.0 else None
+    growth = evidence.growth
+    return Measured(growth) if growth > 0.0 else None
 
 
 def _risk(evidence: Evidence) -> Measured | None:
