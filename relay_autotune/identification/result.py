@@ -217,6 +217,8 @@ class Identification:
     # all act alike.
     effects: tuple[float, float] = (1.0, 1.0)
     middle: float = math.nan
+    # Lowest and highest command that the actuator was found to follow [u].
+    ends: tuple[float, float] = (-math.inf, math.inf)
     # True: the process was not at rest at the relay's baseline when the test began.
     began_away: bool = False
     # True: a step of the load was estimated with the model.
@@ -247,6 +249,7 @@ class Identification:
 
         :param command: u, shape (n,).
         """
+        command = np.clip(command, *self.ends)
         if math.isnan(self.middle):
             return command
         away = command - self.middle

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Processes that are not what a step test is made for: unstable ones, and those with a curve."""
+"""Processes that are not what a step test is made for: unstable, with a curve, or with ends."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from scipy.integrate import odeint
 from relay_autotune.control.controller import PidController
 from relay_autotune.identification.methods import identify
 from relay_autotune.loop.gains import Controller
-from relay_autotune.process.structures import UNSTABLE_FOPDT
+from relay_autotune.process.structures import SOPDT, UNSTABLE_FOPDT
+from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import Record
 
@@ -57,3 +58,25 @@ def test_a_staircase_over_a_gain_that_grows_is_no_integrator():
     assert found.model.gain * above == pytest.approx(1.525, rel=0.1)
     assert found.model.gain * below == pytest.approx(0.775, rel=0.15)
     assert sum(t.real for t in found.model.time_constants) < 40.0
+
+
+@pytest.mark.parametrize("ends", [(-3.0, 8.0), (-5.0, 12.0), (-100.0, 8.0), (-100.0, 100.0)])
+def test_an_actuator_that_ends_is_found_in_what_its_controller_sent(ends):
+    """Without the ends the model was trusted with half of the gain, and a true Ms of 3.5."""
+    process = SOPDT.of_fields(gain=1.5, time_constants=[20.0, 5.0], dead_time=6.0)
+    plant = VirtualProcess(process, disturbances=Disturbances(noise_std=0.1), seed=3)
+    controller, rows = PidController(Controller(1.5, 25.0), 0.0), []
+    for t in np.arange(0.0, 450.0, 1.0):
+        y = plant.measure(t)
+        rows.append((t, y, controller.step(t, 0.0 if t < 20.0 else 10.0 if t < 150.0 else 0.0, y)))
+        plant.command(float(np.clip(rows[-1][-1], *ends)))
+    time, measured, sent = np.array(rows).T
+    found = identify(Record(time, measured, sent))
+    assert found.model.gain == pytest.approx(process.gain, rel=0.02)
+    assert found.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.05)
+    for end, beyond, at in zip(ends, (sent < ends[0], sent > ends[1]), found.ends, strict=True):
+        # An end that no command reached is not known.
+        if np.count_nonzero(beyond) > 10:
+            assert at == pytest.approx(end, abs=0.3)
+    assert ("actuator" in " ".join(found.warnings)) == bool(np.isfinite(found.ends).any())
+    assert np.isfinite(found.ends).any() == (ends != (-100.0, 100.0))

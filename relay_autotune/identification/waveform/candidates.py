@@ -10,6 +10,7 @@ that colour, and the priors of the table below.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -72,12 +73,12 @@ _SAMPLES_EACH = 8
 # Least number of moves of a command that tell whether one came before the record.
 _MANY = 6
 # What may be estimated beside the model, as fields of a problem.
-TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "friction")
+TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "ends", "friction")
 # Those of what went on before the record, for which a dead time can stand.
 _BEFORE = frozenset(("drift", "relaxation", "past"))
-# Steps of a fit with a further term or in another colour; instants at which a load is tried, and
-# steps to the best.
-_STEPS, _INSTANTS, _STEPS_IN_TIME = 15, 60, 4
+# Steps of a fit with a further term or in another colour; instants at which a load is tried,
+# levels at which an actuator may end, and steps to the best of either.
+_STEPS, _INSTANTS, _LEVELS, _STEPS_TO_IT = 15, 60, 6, 4
 
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
 # zero of a slower inverse response as a drift.
@@ -148,7 +149,7 @@ class FitContext:
     sign: int
     held: bool
     loads: bool
-    _fopdts: dict[tuple[float | None, ...], Trial] = field(default_factory=dict, repr=False)
+    _fopdts: dict[tuple[Any, ...], Trial] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, problem: Problem, sign: int, *, held: bool) -> FitContext:
@@ -244,6 +245,9 @@ class FitContext:
         if min(problem.effects(state.coefficients)) < 0.0:
             # Commands may lose their effect on one side, but not act the other way there.
             return None
+        low, high = problem.ends_of(state.coefficients)
+        if not low < high:
+            return None
         if problem.friction and problem.dry_friction(state.coefficients) < self.least_friction:
             return None
         if problem.play and not (
@@ -303,6 +307,8 @@ class FitContext:
             return []
         if terms == ("load",):
             return self.loaded(candidate)
+        if terms == ("ends",):
+            return self._with_ends(candidate)
         changed: dict[str, Any] = dict.fromkeys(terms, True)
         problem = replace(candidate.problem, **changed)
         state = _refined(problem, candidate.state)
@@ -317,6 +323,30 @@ class FitContext:
         :param candidate: in white noise.
         """
         other = self.candidate(*with_load(replace(candidate.problem, load=None), candidate.state))
+        return [] if other is None else [other]
+
+    @cached_property
+    def ends(self) -> tuple[float, float] | None:
+        """The levels at which the actuator may end; None: nothing speaks for any."""
+        return ends_of_actuator(self.problem, self.sign)
+
+    def _with_ends(self, candidate: Candidate) -> list[Candidate]:
+        """Return a candidate whose actuator follows commands up to its ends alone; or none.
+
+        Both are moved by what the times beyond each say.
+        """
+        ends, found = self.ends, candidate.state
+        if ends is None:
+            return []
+        for _ in range(_STEPS_TO_IT):
+            problem = replace(candidate.problem, ends=ends)
+            found = self._out_of_a_wrong_minimum(problem, _refined(problem, found))
+            before, ends = ends, problem.ends_of(found.coefficients)
+            if not ends[0] < ends[1]:
+                return []
+            if np.allclose(before, ends, rtol=0.0, atol=self.least_friction):
+                break
+        other = self.candidate(problem, found)
         return [] if other is None else [other]
 
     def _out_of_a_wrong_minimum(self, problem: Problem, state: Trial) -> Trial:
@@ -348,7 +378,7 @@ class FitContext:
         if not any(nuisances_of(problem)):
             return self.fopdt
         # The samples of a first dead time may have been dropped.
-        key = (problem.time.size, problem.load, *nuisances_of(problem))
+        key = (problem.time.size, problem.load, problem.ends, *nuisances_of(problem))
         if key not in self._fopdts:
             starts = [self.fopdt.theta, *start_fopdt(problem, self.sign)]
             self._fopdts[key] = best_of(problem, starts)
@@ -365,6 +395,7 @@ class FitContext:
             "unequal": self.problem.shows_its_curve,
             "play": self.problem.most_play(held=self.held) >= self.least_friction,
             "load": self.loads and len(self.problem.bounds) == 1,
+            "ends": not self.held and self.problem.shows_its_curve,
             "friction": self.held and bool(self.problem.motions),
         }
         alone: list[tuple[str, ...]] = [(term,) for term in TERMS if needed[term]]
@@ -502,7 +533,7 @@ def with_load(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
     remaining = [float(np.sum(left_of(left, rows) ** 2)) for rows in answers.swapaxes(0, 1)]
     load = float(instants[int(np.argmin(remaining))])
     found = state
-    for _ in range(_STEPS_IN_TIME):
+    for _ in range(_STEPS_TO_IT):
         loaded = replace(problem, load=load)
         found = _refined(loaded, found)
         step, shifts = found.coefficients[loaded.places("load")]
@@ -513,6 +544,32 @@ def with_load(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
         load += min(max(shift, -farthest), farthest)
         load = min(max(load, float(instants[0])), float(instants[-1]))
     return loaded, found
+
+
+def ends_of_actuator(problem: Problem, sign: int) -> tuple[float, float] | None:
+    """Return the levels at which an actuator ends, as a FOPDT and few samples tell.
+
+    All pairs of some levels are tried, and none. An end that explains nothing is infinite. Between
+    ends that are nearer than the levels, an actuator is a switch, and none are taken.
+
+    :param problem: of commands that are held, with a FOPDT structure.
+    :param sign: of the gain, 1 or -1; 0: not known.
+    :return: None: none explains as much as two numbers do in white noise.
+    """
+    few = coarse(problem)
+    sent = np.concatenate([u.levels for u in problem.inputs if isinstance(u, PiecewiseConstant)])
+    _, *levels, _ = np.linspace(sent.min(), sent.max(), _LEVELS + 2).tolist()
+
+    def left(ends: tuple[float, float]) -> float:
+        ended = replace(few, ends=ends)
+        return max(evaluate(ended, start_fopdt(ended, sign)[0]).cost, NEGLIGIBLE**2)
+
+    none = (-math.inf, math.inf)
+    each = itertools.product((none[0], *levels), (*levels, none[1]))
+    least, ends = min((left(e), e) for e in each if e[1] - e[0] > levels[1] - levels[0])
+    n = few.time.size
+    gained = n * math.log(left(none) / least)
+    return ends if gained > 2.0 * math.log(n) else None
 
 
 def needs_no_past(problem: Problem, sign: int) -> bool:

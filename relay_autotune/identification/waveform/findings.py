@@ -116,6 +116,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         parts=allowed.parts,
         effects=problem.effects(state.coefficients),
         middle=middle_of(problem.inputs[0]) if problem.unequal else math.nan,
+        ends=problem.ends_of(state.coefficients),
         began_away=_began_away(records, fit),
         loaded=problem.load is not None,
         play=problem.play_of(state.coefficients),
@@ -311,6 +312,13 @@ def _warnings(
             f"commands above {middle:.4g} u act {above} times as strongly as in the model, "
             f"those below it {below} times: the process is not linear, and the gains hold on "
             "both sides; the weaker direction sets how fast the loop can be"
+        )
+    if fit.problem.ends is not None:
+        levels = fit.problem.ends_of(fit.state.coefficients)
+        ends = " and ".join(f"{end:.4g} u" for end in levels if math.isfinite(end))
+        found.append(
+            f"the actuator follows commands up to {ends} alone, which was estimated with the "
+            "model: record the command that it gets, or let the controller end there"
         )
     if fit.problem.play:
         play = fit.problem.play_of(fit.state.coefficients)

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,8 @@ class Problem:
     :param play: True: play between command and process is estimated, which delays each reversal.
     :param load: when a step of the load came, in the first experiment [s]; its size and a small
         shift of its time are estimated. None: none came.
+    :param ends: lowest and highest command that the actuator follows [u]; small shifts of them are
+        estimated. None: it follows all.
     :param friction: True: dry friction is estimated: a command against each motion, and what it
         takes of the command while the process stands still.
     :param motions: the direction in which the measurement moves, 1 or -1, and the command from
@@ -71,6 +74,7 @@ class Problem:
     unequal: bool = False
     play: bool = False
     load: float | None = None
+    ends: tuple[float, float] | None = None
     friction: bool = False
     motions: tuple[PiecewiseConstant, ...] = ()
     colour: Colour | None = None
@@ -125,6 +129,7 @@ class Problem:
             "unequal": int(self.unequal),
             "play": int(self.play),
             "load": 2 * (self.load is not None),
+            "ends": 2 * (self.ends is not None),
         }
         return tuple(name for name, count in counts.items() for _ in range(count))
 
@@ -153,6 +158,19 @@ class Problem:
         """
         share = self.relative("unequal", coefficients) if self.unequal else 0.0
         return 1.0 + share, 1.0 - share
+
+    def ends_of(self, coefficients: FloatArray) -> tuple[float, float]:
+        """Return the lowest and the highest command that the actuator follows [u].
+
+        They are NaN of a fit without a gain.
+
+        :param coefficients: of a fit, shape (k,).
+        """
+        if self.ends is None:
+            return -math.inf, math.inf
+        gain = float(coefficients[0]) or math.nan
+        low, high = coefficients[self.places("ends")] / gain
+        return self.ends[0] + float(low), self.ends[1] + float(high)
 
     def play_of(self, coefficients: FloatArray) -> float:
         """Return the command that a reversal loses in the play [u]; 0: not estimated.
@@ -216,7 +234,7 @@ class Problem:
 
         :param theta: shape (m,).
         """
-        beside = replace(self, unequal=False, play=False)
+        beside = replace(self, unequal=False, play=False, ends=None)
         return self.seen(beside.columns(theta)[0][len(self.structure.powers) :])
 
     def _of_one(
@@ -250,7 +268,7 @@ class Problem:
         They are the command, then those of `_further` but friction.
         """
         each = zip(self.inputs, self.experiments, strict=True)
-        return [(u, *self._beside(u, part)) for u, part in each]
+        return [(clipped(u, self.ends), *self._beside(u, part)) for u, part in each]
 
     def _beside(self, u: Input, part: slice) -> Iterator[PiecewiseConstant]:
         if self.past:
@@ -262,6 +280,9 @@ class Problem:
             yield _turns(u)
         if self.load is not None:
             yield from (pulse(self.load, length) for length in (math.inf, self.shortest))
+        if self.ends is not None:
+            low, high = self.ends
+            yield from (changed(u, lambda x: x < low), changed(u, lambda x: x > high))
 
     def line(self, time: FloatArray) -> FloatArray:
         """Return the offset and, where estimated, the drift of one experiment, shape (1 or 2, n).
@@ -327,6 +348,21 @@ def pulse(begin: float = 0.0, length: float = math.inf) -> PiecewiseConstant:
     return PiecewiseConstant(np.array([begin, begin + length]), np.array([1.0, 0.0]), 0.0)
 
 
+def changed(u: Input, of: Callable[[FloatArray], NDArray[Any]]) -> PiecewiseConstant:
+    """Return a function of a held command, from its value at first."""
+    assert isinstance(u, PiecewiseConstant)
+    values = np.asarray(of(u.levels), dtype=float)
+    return PiecewiseConstant(u.times, values[1:] - values[0], 0.0)
+
+
+def clipped(u: Input, ends: tuple[float, float] | None) -> Input:
+    """Return what an actuator makes of a command.
+
+    :param ends: as ``Problem.ends``.
+    """
+    return u if ends is None else changed(u, lambda x: np.clip(x, *ends))
+
+
 def middle_of(u: Input) -> float:
     """Return the command above and below which effects may differ [u].
 
@@ -339,9 +375,7 @@ def middle_of(u: Input) -> float:
 
 def _folded(u: Input) -> PiecewiseConstant:
     """Return how much farther from its middle a held command is than at first."""
-    assert isinstance(u, PiecewiseConstant)
-    far = np.abs(u.levels - middle_of(u))
-    return PiecewiseConstant(u.times, far[1:] - far[0], 0.0)
+    return changed(u, lambda x: np.abs(x - middle_of(u)))
 
 
 def _turns(u: Input) -> PiecewiseConstant:
