@@ -12,10 +12,11 @@ from scipy.integrate import odeint
 from relay_autotune.control.controller import PidController
 from relay_autotune.identification.methods import identify
 from relay_autotune.loop.gains import Controller
+from relay_autotune.process.response import response
 from relay_autotune.process.structures import SOPDT, UNSTABLE_FOPDT
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
-from relay_autotune.record.record import Record
+from relay_autotune.record.record import PiecewiseConstant, Record
 
 
 @pytest.mark.parametrize(
@@ -78,5 +79,19 @@ def test_an_actuator_that_ends_is_found_in_what_its_controller_sent(ends):
         # An end that no command reached is not known.
         if np.count_nonzero(beyond) > 10:
             assert at == pytest.approx(end, abs=0.3)
-    assert ("actuator" in " ".join(found.warnings)) == bool(np.isfinite(found.ends).any())
+    assert ("an actuator with ends" in " ".join(found.warnings)) == bool(
+        np.isfinite(found.ends).any()
+    )
     assert np.isfinite(found.ends).any() == (ends != (-100.0, 100.0))
+
+
+def test_a_dead_zone_is_the_lower_end_of_what_is_answered():
+    """It was trusted with four fifths of the gain."""
+    time = np.arange(400) * 1.0
+    command = 1.5 * np.floor(time / 80.0)
+    process = SOPDT.of_fields(gain=1.5, time_constants=[20.0, 5.0], dead_time=6.0)
+    felt = PiecewiseConstant.from_samples(time, np.maximum(command, 2.0))
+    noise = 0.1 * np.random.default_rng(1).standard_normal(time.size)
+    found = identify(Record(time, response(process, time, felt) + noise, command))
+    assert found.model.gain == pytest.approx(process.gain, rel=0.03)
+    assert found.ends[0] == pytest.approx(2.0, abs=0.15)

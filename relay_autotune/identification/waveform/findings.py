@@ -314,11 +314,12 @@ def _warnings(
             "both sides; the weaker direction sets how fast the loop can be"
         )
     if fit.problem.ends is not None:
-        levels = fit.problem.ends_of(fit.state.coefficients)
-        ends = " and ".join(f"{end:.4g} u" for end in levels if math.isfinite(end))
+        sides = zip(("above", "below"), fit.problem.ends_of(fit.state.coefficients), strict=True)
+        between = " and ".join(f"{side} {end:.4g} u" for side, end in sides if math.isfinite(end))
         found.append(
-            f"the actuator follows commands up to {ends} alone, which was estimated with the "
-            "model: record the command that it gets, or let the controller end there"
+            f"the process answers commands {between} alone, as an actuator with ends or a dead "
+            "zone does, which was estimated with the model: record the command that the actuator "
+            "gets, and let the controller end where it does"
         )
     if fit.problem.play:
         play = fit.problem.play_of(fit.state.coefficients)
