@@ -268,7 +268,7 @@ class Problem:
         They are the command, then those of `_further` but friction.
         """
         each = zip(self.inputs, self.experiments, strict=True)
-        return [(clipped(u, self.ends), *self._beside(u, part)) for u, part in each]
+        return [(_clipped(u, self.ends), *self._beside(u, part)) for u, part in each]
 
     def _beside(self, u: Input, part: slice) -> Iterator[PiecewiseConstant]:
         if self.past:
@@ -282,7 +282,7 @@ class Problem:
             yield from (pulse(self.load, length) for length in (math.inf, self.shortest))
         if self.ends is not None:
             low, high = self.ends
-            yield from (changed(u, lambda x: x < low), changed(u, lambda x: x > high))
+            yield from (_changed(u, lambda x: x < low), _changed(u, lambda x: x > high))
 
     def line(self, time: FloatArray) -> FloatArray:
         """Return the offset and, where estimated, the drift of one experiment, shape (1 or 2, n).
@@ -348,19 +348,19 @@ def pulse(begin: float = 0.0, length: float = math.inf) -> PiecewiseConstant:
     return PiecewiseConstant(np.array([begin, begin + length]), np.array([1.0, 0.0]), 0.0)
 
 
-def changed(u: Input, of: Callable[[FloatArray], NDArray[Any]]) -> PiecewiseConstant:
+def _changed(u: Input, of: Callable[[FloatArray], NDArray[Any]]) -> PiecewiseConstant:
     """Return a function of a held command, from its value at first."""
     assert isinstance(u, PiecewiseConstant)
     values = np.asarray(of(u.levels), dtype=float)
     return PiecewiseConstant(u.times, values[1:] - values[0], 0.0)
 
 
-def clipped(u: Input, ends: tuple[float, float] | None) -> Input:
+def _clipped(u: Input, ends: tuple[float, float] | None) -> Input:
     """Return what an actuator makes of a command.
 
     :param ends: as ``Problem.ends``.
     """
-    return u if ends is None else changed(u, lambda x: np.clip(x, *ends))
+    return u if ends is None else _changed(u, lambda x: np.clip(x, *ends))
 
 
 def middle_of(u: Input) -> float:
@@ -375,7 +375,7 @@ def middle_of(u: Input) -> float:
 
 def _folded(u: Input) -> PiecewiseConstant:
     """Return how much farther from its middle a held command is than at first."""
-    return changed(u, lambda x: np.abs(x - middle_of(u)))
+    return _changed(u, lambda x: np.abs(x - middle_of(u)))
 
 
 def _turns(u: Input) -> PiecewiseConstant:
