@@ -53,6 +53,7 @@ UNTOLD = {
             "fitted",
             "effects",
             "middle",
+            "ends",
             "play",
             "friction",
             "began_away",
