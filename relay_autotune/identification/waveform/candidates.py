@@ -149,7 +149,7 @@ class FitContext:
     sign: int
     held: bool
     loads: bool
-    _fopdts: dict[tuple[Any, ...], Trial] = field(default_factory=dict, repr=False)
+    _fopdts: dict[tuple[object, ...], Trial] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, problem: Problem, sign: int, *, held: bool) -> FitContext:
@@ -342,9 +342,8 @@ class FitContext:
             problem = replace(candidate.problem, ends=ends)
             found = self._out_of_a_wrong_minimum(problem, _refined(problem, found))
             before, ends = ends, problem.ends_of(found.coefficients)
-            if not ends[0] < ends[1]:
-                return []
-            if np.allclose(before, ends, rtol=0.0, atol=self.least_friction):
+            settled = np.allclose(before, ends, rtol=0.0, atol=self.least_friction)
+            if settled or not ends[0] < ends[1]:
                 break
         other = self.candidate(problem, found)
         return [] if other is None else [other]
@@ -565,10 +564,11 @@ def ends_of_actuator(problem: Problem, sign: int) -> tuple[float, float] | None:
         return max(evaluate(ended, start_fopdt(ended, sign)[0]).cost, NEGLIGIBLE**2)
 
     none = (-math.inf, math.inf)
-    each = itertools.product((none[0], *levels), (*levels, none[1]))
-    least, ends = min((left(e), e) for e in each if e[1] - e[0] > levels[1] - levels[0])
+    pairs = itertools.product((none[0], *levels), (*levels, none[1]))
+    costs = {e: left(e) for e in pairs if e[1] - e[0] > levels[1] - levels[0]}
+    ends = min(costs, key=costs.__getitem__)
     n = few.time.size
-    gained = n * math.log(left(none) / least)
+    gained = n * math.log(costs[none] / costs[ends])
     return ends if gained > 2.0 * math.log(n) else None
 
 
