@@ -28,6 +28,7 @@ from relay_autotune.errors import ModelError
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.posterior import DRAWS
 from relay_autotune.identification.waveform.residuals import Colour, colour_cost, colour_of
+from relay_autotune.identification.waveform.separable import left_of
 from relay_autotune.process.model_set import ModelErrors
 from relay_autotune.process.response import response
 from relay_autotune.record.record import PiecewiseConstant, Record
@@ -40,6 +41,8 @@ _DECAY = 3.0
 # Ratios of the powers of difference and noise, of which the most likely one is taken.
 _RATIOS = np.concatenate(([0.0], np.geomspace(1e-3, 1e12, 61)))
 _TURNS = 2
+# Length of a piece with a drift of its own, times w_u, and least number of its samples.
+_A_PIECE, _LEAST_PIECE = 60.0, 8
 # Largest factor of an ultimate point from the model's, and frequencies at which it is sought.
 _FAR, _NEAR = 4.0, 241
 # Shares below which a direction of the nuisances, and the square of one of the increments, are
@@ -55,6 +58,8 @@ class Difference:
     :param mean: increments of its step response [y/u], shape (m,).
     :param root: of their covariance, shape (m, k).
     :param residual: rms of what neither model nor difference explain [y].
+    :param unexplained: share of the measurement's variance that neither they nor noise explain,
+        beside a slow drift.
     :param lowest: frequency of which the record shows one radian [rad/s].
     """
 
@@ -62,6 +67,7 @@ class Difference:
     mean: FloatArray
     root: FloatArray
     residual: float
+    unexplained: float
     lowest: float
 
     def draws(self, count: int, rng: np.random.Generator) -> ModelErrors:
@@ -167,7 +173,30 @@ def _difference(found: Identification, record: Record) -> Difference | None:
     prior = size[:, None] * np.linalg.cholesky(alike)
     shown = _posterior(left[known], nuisances[:, known], moved, prior)
     residual = math.sqrt(float(np.mean(shown.left**2)))
-    return Difference(edges, shown.mean, shown.root, residual, 1.0 / record.duration)
+    w = found.ultimate_frequency
+    pieces = record.duration * (w if math.isfinite(w) else 1.0 / whole) / _A_PIECE
+    pieces = max(int(min(pieces, shown.left.size / _LEAST_PIECE)), 1)
+    noise, total = (
+        _power_beside_lines(time[known], x, pieces)
+        for x in (shown.left, record.measurement[few[known]])
+    )
+    unexplained = max(noise - record.noise**2, 0.0) / max(total, 1e-300)
+    lowest = 1.0 / record.duration
+    return Difference(edges, shown.mean, shown.root, residual, unexplained, lowest)
+
+
+def _power_beside_lines(time: FloatArray, x: FloatArray, pieces: int) -> float:
+    """Return the variance of samples beside another line in each of some pieces.
+
+    A disturbance so slow is no evidence for or against a model near its ultimate frequency.
+
+    :param time: s, shape (n,).
+    :param x: shape (n,).
+    :param pieces: with as many samples each.
+    """
+    parts = zip(np.array_split(time, pieces), np.array_split(x, pieces), strict=True)
+    left = [left_of(part, np.stack((np.ones(t.size), t - t[0]))) for t, part in parts]
+    return sum(float(e @ e) for e in left) / (x.size - 2 * pieces)
 
 
 @dataclass(frozen=True, eq=False)

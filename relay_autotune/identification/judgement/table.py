@@ -49,7 +49,10 @@ def _share(evidence: Evidence) -> Measured | None:
     found, difference = evidence.found, evidence.difference
     # What a response beside the model's explains is in the risk.
     left = found.fit.residual_rms if difference is None else difference.residual
-    return None if math.isnan(left) else Measured(unexplained_share(found, evidence.record, left))
+    if math.isnan(left):
+        return None
+    share = unexplained_share(found, evidence.record, left)
+    return Measured(share if difference is None else min(share, difference.unexplained))
 
 
 def _limit_cycle(evidence: Evidence) -> Measured | None:
@@ -204,7 +207,8 @@ MODEL_CHECKS = (
         name="explained",
         title="Fit",
         what="share of the measurement's variance beside drift, past and load that neither a "
-        "response to the command nor noise explains",
+        "response to the command nor noise explains; where that is less, beside a line in each "
+        "60/w_u",
         unit="",
         doubtful=0.1,
         failed=0.5,
