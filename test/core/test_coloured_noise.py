@@ -41,6 +41,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.cycles import find_relay, infer_settings
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
+from relay_autotune.verdict import Verdict
 
 pytestmark = pytest.mark.long
 
@@ -468,3 +469,41 @@ def test_a_measurement_of_another_process_is_no_response():
             refused += "no response" in str(error)
     # One in eight may move with the command by chance.
     assert refused >= 7
+
+
+def pulses_over_a_drift(gain: float, *, walks: bool) -> Record:
+    """Return two hours of a heater under pulses, beside a drift of several times its answer."""
+    rng, period = np.random.default_rng(4), 2.0
+    time = period * np.arange(3600)
+    begins = 400.0 * np.arange(1, 18) + rng.uniform(0.0, 100.0, 17)
+    moves = np.stack((begins, begins + rng.uniform(60.0, 200.0, 17)), axis=1).ravel()
+    command = 30.0 + 20.0 * (np.searchsorted(moves, time, side="right") % 2)
+    late = np.concatenate((np.zeros(3), command[:-3] - 30.0))
+
+    def lag(tau, x):
+        return lfilter([0.0, -math.expm1(-period / tau)], [1.0, -math.exp(-period / tau)], x)
+
+    # Partial fractions of 1/((20 s + 1)(5 s + 1)).
+    heat = (20.0 * lag(20.0, late) - 5.0 * lag(5.0, late)) / 15.0
+    drift = 100.0 * np.sin(2.0 * math.pi * time / 14_400.0 + 1.0)
+    drift += np.cumsum(rng.normal(0.0, 0.2, time.size))
+    if not walks:
+        weather = np.random.default_rng(5).standard_normal(time.size)
+        weather = lag(100.0, lag(1500.0, weather))
+        drift = 90.0 * weather / np.ptp(weather)
+    noise = rng.normal(0.0, 0.05, time.size)
+    return Record(time=time, measurement=50.0 + gain * heat + drift + noise, command=command)
+
+
+@pytest.mark.parametrize("walks", [True, False])
+def test_pulses_over_a_drift_of_several_times_their_answer_show_the_process(walks):
+    """They were refused: too little was explained, or a slow model, and no response."""
+    found = analyse(pulses_over_a_drift(1.5, walks=walks), alone=True)
+    process = TransferFunction(1.5, time_constants=(20.0, 5.0), dead_time=6.0)
+    assert found.verdict is Verdict.TRUSTED
+    assert found.model.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.1)
+
+
+def test_a_drift_alone_shows_none():
+    found = analyse(pulses_over_a_drift(0.0, walks=True), alone=True)
+    assert "no response" in found.reason

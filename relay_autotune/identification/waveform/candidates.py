@@ -70,8 +70,9 @@ from relay_autotune.record.record import Input, PiecewiseConstant
 MOST_LAGS = 8
 _MOST_LAGS_WITH_ZERO = 4
 _SAMPLES_EACH = 8
-# Least number of moves of a command that tell whether one came before the record.
-_MANY = 6
+# Least number of moves of a command that tell whether one came before the record, and show a
+# response beside a slow disturbance.
+MANY = 6
 # What may be estimated beside the model, as fields of a problem.
 TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "ends", "friction")
 # Those of what went on before the record, for which a dead time can stand.
@@ -402,11 +403,11 @@ class FitContext:
         return [*alone, ("relaxation", "past")] if needed["past"] else alone
 
     def with_nuisances_of(self, candidate: Candidate) -> FitContext:
-        """Return the context with the terms beside the model of a candidate.
+        """Return the context with the terms beside the model of a candidate, in its own colour.
 
         :param candidate: fitted to the same samples.
         """
-        problem = replace(candidate.problem, structure=FOPDT, colour=None)
+        problem = replace(candidate.problem, structure=FOPDT, colour=self.problem.colour)
         fopdt = self._fopdt_of(problem)
         # A FOPDT has the longest dead time of all, since it includes every small lag.
         problem = drop_first_dead_time(problem, fopdt)
@@ -415,7 +416,7 @@ class FitContext:
     def fit(
         self, names: Iterable[str], order: int = 0, ready: Sequence[Candidate] = ()
     ) -> list[Candidate]:
-        """Fit structures in white noise, one after the other: a hopeless one is given up early.
+        """Fit structures in one colour, one after the other: a hopeless one is given up early.
 
         :param names: of the structures.
         :param order: of equal lags; 0: several.
@@ -583,7 +584,7 @@ def needs_no_past(problem: Problem, sign: int) -> bool:
     :param sign: the direction in which the relay worked, 1 or -1; 0: not known.
     """
     return not sign and all(
-        changes_within(u, problem.time[part]).size < _MANY
+        changes_within(u, problem.time[part]).size < MANY
         and begins_at_rest(problem.time[part], problem.y[part], u)
         for part, u in zip(problem.experiments, problem.inputs, strict=True)
     )

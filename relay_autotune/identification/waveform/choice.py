@@ -98,7 +98,7 @@ _ALIKE = 0.01
 # Gain in the score from which a response counts as one: odds of 20,000 to 1. Of 90 simulated pairs
 # of command and measurement that belong together it refused 4 whose gains were trusted, and of 90
 # that do not, 23 of the 43 with gains.
-_ANSWERED = 20.0
+ANSWERED = 20.0
 # Mean square that a model in colour may leave, over that of the best simulation: a colour near a
 # random walk explains the response itself. Of 50 records with every kind of noise and a process
 # that is not linear, the right model left up to 3.6 times as much (benchmarks/unmodelled.py).
@@ -123,7 +123,8 @@ def chosen_fit(
 ) -> Fit:
     """Return the fit of the best structure, in the colour of its noise.
 
-    :param problem: samples and input, with a FOPDT structure.
+    :param problem: samples and input, with a FOPDT structure; its colour is that in which the
+        search begins.
     :param known: the structure, if it is known.
     :param sign: direction of the relay, 1 or -1; 0: not known.
     :param scale: range of the measurement [y].
@@ -146,8 +147,9 @@ def chosen_fit(
         turned = (few.refit(c, found[0].problem.colour) for c in few.turned())
         found = [*found, *(c for c in turned if c is not None)]
     # Where a disturbance that no term describes made a colour that explains the response, too,
-    # the simulation shows it, and the direction.
-    white = [c if c.problem.colour is None else few.refit(c, None) for c in own]
+    # the simulation shows it, and the direction; unless that disturbance is all it shows.
+    slow = problem.colour is not None
+    white = [c if slow or c.problem.colour is None else few.refit(c, None) for c in own]
     simulated = [w for c, w in zip(own, white, strict=True) if w is not None and w is not c]
     own = [
         c
@@ -162,7 +164,7 @@ def chosen_fit(
     if not fits:
         raise no_response(known)
     # Before a jump or without spikes the best simulation may: it shows these.
-    best = next((f for f in fits if outweighs_disturbance(f.problem, f.state)), fits[-1])
+    best = next((f for f in fits if odds_of_response(f.problem, f.state) > ANSWERED), fits[-1])
     plain = next((c for c in own if c.structure == FOPDT), None)
     if plain is None or best.problem.structure == FOPDT:
         return best
@@ -201,8 +203,8 @@ def no_response(known: Known) -> IdentificationError:
     )
 
 
-def outweighs_disturbance(problem: Problem, state: Trial) -> bool:
-    """Return whether a response to the command is likelier than a disturbance alone.
+def odds_of_response(problem: Problem, state: Trial) -> float:
+    """Return by how much the score of a response is better than that of a disturbance alone.
 
     Each is in the colour of what it leaves. A slow disturbance explains any single slow excursion
     of the measurement; each further change of the command that is answered adds to the odds. They
@@ -215,10 +217,7 @@ def outweighs_disturbance(problem: Problem, state: Trial) -> bool:
     white = replace(problem, colour=None)
     takes = unit_steps(problem.structure, state.theta, problem.shortest)[-1]
     some = int(_A_CURVE * max(float(np.ptp(problem.time) / takes), _RESPONSES))
-    return any(
-        _odds(white.thinned(most), state.theta, problem.colour) > _ANSWERED
-        for most in (_MOST, some)
-    )
+    return max(_odds(white.thinned(most), state.theta, problem.colour) for most in (_MOST, some))
 
 
 def ahead_of_command(problem: Problem, state: Trial) -> float:
@@ -244,7 +243,7 @@ def ahead_of_command(problem: Problem, state: Trial) -> float:
     for c in context.fit(PLAIN):
         own = refine(replace(c.problem, colour=problem.colour), c.state.theta, tolerance=TRIAL)
         by = earlier - float(own.theta[-1])
-        if by > _ROWS * problem.shortest and score(state) - score(own) > _ANSWERED:
+        if by > _ROWS * problem.shortest and score(state) - score(own) > ANSWERED:
             return by
     return 0.0
 
@@ -404,11 +403,12 @@ def _with_terms(
     some = [n for n in names if TABLE[n].integrators or not decided.problem.friction]
     inside = context.with_nuisances_of(decided)
     found = _likeliest_colour(inside, inside.fit(some, known.order, (*ready, decided)))
-    white = context.refit(found[0], None) if found and not known.structure else None
-    if white is None:
+    first = context.problem.colour
+    start = context.refit(found[0], first) if found and not known.structure else None
+    if start is None:
         return found
-    again = _with_best_terms(context, [white])
-    if again is white:
+    again = _with_best_terms(context, [start])
+    if again is start:
         return found
     other = _with_terms(context, known, names, again, ready)
     return min(other or found, found, key=lambda each: each[0].score)
@@ -461,7 +461,7 @@ def _likeliest_colour(context: FitContext, simulated: list[Candidate]) -> list[C
     if own is None:
         return simulated
     found = _converged(_in(own, simulated, context), context)
-    least = min(c.state.cost / c.problem.time.size for c in simulated)
+    least = min(map(_left, simulated))
     return found if found and _simulates(found[0], least) else simulated
 
 
@@ -514,10 +514,13 @@ def _simulates(candidate: Candidate, least: float) -> bool:
     :param candidate: fitted in a colour.
     :param least: mean square that the best simulation leaves.
     """
-    left, _ = left_in_simulation(
-        candidate.problem, candidate.state.coefficients, candidate.state.theta
-    )
-    return left**2 <= _WORSE * least
+    return _left(candidate) <= _WORSE * least
+
+
+def _left(candidate: Candidate) -> float:
+    """Return the mean square that a candidate leaves in simulation."""
+    state = candidate.state
+    return left_in_simulation(candidate.problem, state.coefficients, state.theta)[0] ** 2
 
 
 def _finished(

@@ -15,6 +15,7 @@ drift and initial state.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -26,14 +27,16 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
+from relay_autotune.identification.waveform.candidates import MANY
 from relay_autotune.identification.waveform.choice import (
+    ANSWERED,
     SIMPLE,
     TRIED,
     ahead_of_command,
     chosen_fit,
     names_near,
     no_response,
-    outweighs_disturbance,
+    odds_of_response,
 )
 from relay_autotune.identification.waveform.findings import report
 from relay_autotune.identification.waveform.fit_covariance import (
@@ -48,8 +51,9 @@ from relay_autotune.identification.waveform.problem import (
     problem_of,
 )
 from relay_autotune.identification.waveform.rational import unit_steps
-from relay_autotune.identification.waveform.residuals import scale_of, weights
+from relay_autotune.identification.waveform.residuals import scale_of, slow_colour, weights
 from relay_autotune.identification.waveform.separable import TRIAL, Trial, evaluate, refine
+from relay_autotune.identification.waveform.starts import is_controlled
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, TABLE
 from relay_autotune.record.excitation import at_its_ends, changes_within, smooth
@@ -72,6 +76,8 @@ _MOST_LATE, _DIVIDED = 0.05, 0.5
 # standard deviations of the noise and as a share of the range; samples that show whether the model
 # moves on.
 _STILL_NOISE, _STILL, _FEW = 3.0, 0.02, 500
+# Odds of a response, as a score, from which it is not sought a second time.
+_OVERWHELMING = 200.0
 # Ratio of two records' noise up to which they count as equal.
 _ALIKE = 1.2
 _MOST_ROUNDS = 20
@@ -160,9 +166,25 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
     if not sign and len(problem.bounds) == 1:
         # Under a relay it turns around.
         problem, stopped = _before_stop(problem, chosen)
-    fit = _by_noise(problem, chosen(problem), chosen)
-    fit = _spared_of_outliers(problem, fit, known, chosen)
-    if not outweighs_disturbance(fit.problem, fit.state):
+
+    def searched(samples: Problem) -> tuple[float, Fit | None]:
+        try:
+            fit = _by_noise(samples, chosen(samples), chosen)
+            fit = _spared_of_outliers(samples, fit, known, chosen)
+        except IdentificationError:
+            return -math.inf, None
+        return odds_of_response(fit.problem, fit.state), fit
+
+    odds, fit = searched(problem)
+    parts = zip(problem.experiments, problem.inputs, strict=True)
+    open_loop = not held and all(_moves_often(problem.time[part], u) for part, u in parts)
+    if odds < _OVERWHELMING and open_loop:
+        # Beside a slow disturbance, what moves from sample to sample shows the response.
+        slow = replace(problem, colour=slow_colour(problem.time.size))
+        likelier, other = searched(slow)
+        if likelier > odds + ANSWERED:
+            odds, fit = likelier, other
+    if fit is None or odds <= ANSWERED:
         raise no_response(known)
     if not held and (ahead := ahead_of_command(fit.problem, fit.state)):
         raise IdentificationError(
@@ -171,6 +193,11 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
             "the measurement"
         )
     return replace(fit, warnings=(*fit.warnings, stopped)) if stopped else fit
+
+
+def _moves_often(time: FloatArray, u: Input) -> bool:
+    """Return whether a command moves many times, and not as a controller's does."""
+    return changes_within(u, time).size >= MANY and not is_controlled(time, u)
 
 
 def _before_stop(problem: Problem, chosen: Choose) -> tuple[Problem, str]:

@@ -242,3 +242,12 @@ def _colour(coefficients: FloatArray, reflections: FloatArray) -> Colour:
         k = reflections[order]
         a = np.concatenate((a - k * a[::-1], [k]))
     return Colour(coefficients, begin)
+
+
+def slow_colour(samples: int) -> Colour:
+    """Return the colour of a slow disturbance, an autoregression of first order.
+
+    :param samples: of the record, ten correlation times of it.
+    """
+    pole = 1.0 - _SLOWEST / samples
+    return Colour(np.array([pole]), np.array([[math.sqrt(1.0 - pole**2)]]))

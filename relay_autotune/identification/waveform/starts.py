@@ -315,12 +315,17 @@ def _costs(
         if problem.relaxation:
             free, _ = free_motion(problem.structure.denominator, theta, time)
             fixed = np.concatenate((fixed, free))
-        terms = np.stack([*(np.broadcast_to(row, moved.shape) for row in fixed), *shifted], -1)
+        rows = np.stack(
+            [np.broadcast_to(row, moved.shape) for row in (y, response, *fixed, *shifted)]
+        )
+        if problem.colour is not None:
+            rows = problem.colour.whitened(rows)
+        y, response, *beside = rows
+        terms = np.stack(beside, -1)
         basis, _ = np.linalg.qr(terms / np.maximum(np.linalg.norm(terms, axis=1), 1e-300)[:, None])
-        for_each = np.broadcast_to(y, moved.shape)
         left, response = (
             rows - np.einsum("dnk,dk->dn", basis, np.einsum("dnk,dn->dk", basis, rows))
-            for rows in (for_each, response)
+            for rows in (y, response)
         )
         power += np.einsum("dn,dn->d", response, response)
         along += np.einsum("dn,dn->d", response, left)
