@@ -273,6 +273,7 @@ class _Designs:
     :param rule: the rule that was asked for.
     :param form: in which gains are shown: "isa", "parallel" or "series".
     :param every: whether all rules are asked, beside that one.
+    :param known: what that one gives, if it was asked before.
     :raises TuningError: if that one is asked alone, and gives none.
     """
 
@@ -280,12 +281,13 @@ class _Designs:
     rule: str
     form: str
     every: bool
+    known: Sequence[Gains] = ()
 
     def __post_init__(self) -> None:
         # Those of the rules that apply, the chosen one's first; by name, why a rule gives none.
-        self.gains: list[Gains] = []
-        self.refused: dict[str, str] = {}
-        for name in sorted(RULES, key=lambda n: n != self.rule) if self.every else [self.rule]:
+        self.gains, self.refused = list(self.known), dict[str, str]()
+        names = sorted(RULES, key=lambda n: n != self.rule) if self.every else [self.rule]
+        for name in names[len(self.known) :]:
             with self._refusing(name):
                 self.gains.append(design(self.task, name))
 
@@ -529,6 +531,6 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if not found.gains:
         say(PROGRAM, "no rule gives gains for this model")
     if options.web:
-        every = found if options.table else replace(found, every=True)
+        every = found if options.table else replace(found, every=True, known=found.gains)
         show(PROGRAM, parser, options, [(every.case(), Shaping(task))])
     return DONE if found.gains else NOTHING_FOUND
