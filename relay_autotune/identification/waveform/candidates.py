@@ -10,7 +10,6 @@ that colour, and the priors of the table below.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -41,6 +40,7 @@ from relay_autotune.identification.waveform.starts import (
     is_controlled,
     is_unobservable,
     latest_dead_times,
+    likeliest_ends,
     longest_push,
     multistart,
     shifted_columns,
@@ -65,7 +65,7 @@ from relay_autotune.record.excitation import (
     changes_within,
     longest_stay,
 )
-from relay_autotune.record.record import Input, PiecewiseConstant
+from relay_autotune.record.record import Input
 
 MOST_LAGS = 8
 _MOST_LAGS_WITH_ZERO = 4
@@ -75,18 +75,14 @@ _SAMPLES_EACH = 8
 MANY = 6
 # What may be estimated beside the model, as fields of a problem.
 TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "ends", "friction")
-# Those of what went on before the record, for which a dead time can stand.
-_BEFORE = frozenset(("drift", "relaxation", "past"))
-# Steps of a fit with a further term or in another colour; instants at which a load is tried,
-# levels at which an actuator may end, and steps to the best of either.
-_STEPS, _INSTANTS, _LEVELS, _STEPS_TO_IT = 15, 60, 6, 4
+# Those for which a dead time or a lag can stand.
+_HIDDEN = frozenset(("drift", "relaxation", "past", "ends"))
+# Steps of a fit with a further term or in another colour, and how often a load and ends are moved.
+_STEPS, _MOVES = 15, 4
 
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
 # zero of a slower inverse response as a drift.
 _LASTING = 2.0
-# Least dry friction or play, as a share of the command's range: the steps of a sensor look like
-# a tenth.
-_LEAST_FRICTION = 0.01
 
 
 @dataclass(frozen=True)
@@ -190,14 +186,6 @@ class FitContext:
         return latest_dead_times(self.problem, self.sign)
 
     @cached_property
-    def least_friction(self) -> float:
-        """Least dry friction or play that counts [u]; infinite for ramps, which show neither."""
-        u = self.problem.inputs[0]
-        if not isinstance(u, PiecewiseConstant):
-            return math.inf
-        return _LEAST_FRICTION * float(np.ptp(u.levels))
-
-    @cached_property
     def bounded(self) -> bool:
         """True if a relay or a controller held the process, so that it may grow by itself."""
         return self.held or all(is_controlled(time, u) for time, u in self._parts)
@@ -249,10 +237,13 @@ class FitContext:
         low, high = problem.ends_of(state.coefficients)
         if not low < high:
             return None
-        if problem.friction and problem.dry_friction(state.coefficients) < self.least_friction:
+        if (
+            problem.friction
+            and problem.dry_friction(state.coefficients) < self.problem.least_command
+        ):
             return None
         if problem.play and not (
-            self.least_friction
+            self.problem.least_command
             <= problem.play_of(state.coefficients)
             <= problem.most_play(held=self.held)
         ):
@@ -306,15 +297,20 @@ class FitContext:
         if "friction" in terms and not candidate.structure.integrators:
             # It acts against the motion of a position.
             return []
-        if terms == ("load",):
-            return self.loaded(candidate)
-        if terms == ("ends",):
-            return self._with_ends(candidate)
         changed: dict[str, Any] = dict.fromkeys(terms, True)
-        problem = replace(candidate.problem, **changed)
-        state = _refined(problem, candidate.state)
-        if not _BEFORE.isdisjoint(terms):
-            state = self._out_of_a_wrong_minimum(problem, state)
+        if "ends" in terms:
+            changed["ends"] = self.ends
+            if self.ends is None:
+                return []
+        if "load" in terms:
+            changed["load"] = likeliest_load(candidate.problem, candidate.state)
+        problem, state = _settled(replace(candidate.problem, **changed), candidate.state)
+        if not _HIDDEN.isdisjoint(terms):
+            again = self._out_of_a_wrong_minimum(problem, state)
+            problem, state = (problem, state) if again is state else _settled(problem, again)
+        if "ends" in terms and self.bounded and state.cost >= self.unstable.cost:
+            # What a controller keeps from growing looks as if large commands were not answered.
+            return []
         other = self.candidate(problem, state)
         return [] if other is None else [other]
 
@@ -323,31 +319,13 @@ class FitContext:
 
         :param candidate: in white noise.
         """
-        other = self.candidate(*with_load(replace(candidate.problem, load=None), candidate.state))
-        return [] if other is None else [other]
+        problem = replace(candidate.problem, load=None)
+        return self.with_terms(replace(candidate, problem=problem), ("load",))
 
     @cached_property
     def ends(self) -> tuple[float, float] | None:
         """The levels at which the actuator may end; None: nothing speaks for any."""
-        return ends_of_actuator(self.problem, self.sign)
-
-    def _with_ends(self, candidate: Candidate) -> list[Candidate]:
-        """Return a candidate whose actuator follows commands up to its ends alone; or none.
-
-        Both are moved by what the times beyond each say.
-        """
-        ends, found = self.ends, candidate.state
-        if ends is None:
-            return []
-        for _ in range(_STEPS_TO_IT):
-            problem = replace(candidate.problem, ends=ends)
-            found = self._out_of_a_wrong_minimum(problem, _refined(problem, found))
-            before, ends = ends, problem.ends_of(found.coefficients)
-            settled = np.allclose(before, ends, rtol=0.0, atol=self.least_friction)
-            if settled or not ends[0] < ends[1]:
-                break
-        other = self.candidate(problem, found)
-        return [] if other is None else [other]
+        return likeliest_ends(self.problem)
 
     def _out_of_a_wrong_minimum(self, problem: Problem, state: Trial) -> Trial:
         """Return a fit with a further term, begun anew where a FOPDT explains more.
@@ -393,7 +371,7 @@ class FitContext:
             "relaxation": not rested,
             "past": not rested and self.problem.past_is_open,
             "unequal": self.problem.shows_its_curve,
-            "play": self.problem.most_play(held=self.held) >= self.least_friction,
+            "play": self.problem.most_play(held=self.held) >= self.problem.least_command,
             "load": self.loads and len(self.problem.bounds) == 1,
             "ends": not self.held and self.problem.shows_its_curve,
             "friction": self.held and bool(self.problem.motions),
@@ -493,6 +471,17 @@ def _refined(problem: Problem, state: Trial) -> Trial:
     return refine(problem, state.theta, tolerance=TRIAL, most=_STEPS)
 
 
+def _settled(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
+    """Return a problem with its load and ends where its fit says that they are, and that fit."""
+    state = _refined(problem, state)
+    for _ in range(_MOVES):
+        moved = problem.moved(state.coefficients)
+        if moved is problem:
+            break
+        problem, state = moved, _refined(moved, state)
+    return problem, state
+
+
 def nuisances_of(problem: Problem, terms: Iterable[str] = TERMS) -> tuple[bool, ...]:
     """Return which of some terms beside the model are estimated."""
     # A load may come at 0 s, which is no False.
@@ -511,11 +500,10 @@ def as_in(other: Problem, problem: Problem) -> Problem:
     return replace(problem, structure=other.structure, **terms)
 
 
-def with_load(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
-    """Return a problem with a step of the load, at the instant that explains most, and its fit.
+def likeliest_load(problem: Problem, state: Trial) -> float:
+    """Return the instant of some at which a step of the load explains most [s].
 
-    At each of some instants the least squares are found with the model linearised about its fit
-    without a load. From the best one, the instant is moved by what the pulse beside the step says.
+    At each the least squares are found with the model linearised about its fit without a load.
 
     :param problem: of one experiment, without a load.
     :param state: its fit.
@@ -524,53 +512,12 @@ def with_load(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
     known = evaluate(few, state.theta)
     basis, _ = np.linalg.qr(np.concatenate((known.columns, known.derivative)).T)
     left = known.residual - basis @ (basis.T @ known.residual)
-    time = problem.time
-    begin = float(problem.inputs[0].times[0])
-    instants = np.linspace(max(begin, float(time[0])), float(time[-1]), _INSTANTS + 2)[1:-1]
+    instants = problem.instants
     moved = few.time - instants[:, None]
     answers = few.seen(shifted_columns(few.structure, state.theta, moved, pulse()))
     answers = answers - (answers @ basis) @ basis.T
     remaining = [float(np.sum(left_of(left, rows) ** 2)) for rows in answers.swapaxes(0, 1)]
-    load = float(instants[int(np.argmin(remaining))])
-    found = state
-    for _ in range(_STEPS_TO_IT):
-        loaded = replace(problem, load=load)
-        found = _refined(loaded, found)
-        step, shifts = found.coefficients[loaded.places("load")]
-        shift = -float(shifts / step) * problem.shortest if step else 0.0
-        farthest = float(instants[1] - instants[0])
-        if abs(shift) < problem.shortest:
-            break
-        load += min(max(shift, -farthest), farthest)
-        load = min(max(load, float(instants[0])), float(instants[-1]))
-    return loaded, found
-
-
-def ends_of_actuator(problem: Problem, sign: int) -> tuple[float, float] | None:
-    """Return the levels at which an actuator ends, as a FOPDT and few samples tell.
-
-    All pairs of some levels are tried, and none. An end that explains nothing is infinite. Between
-    ends that are nearer than the levels, an actuator is a switch, and none are taken.
-
-    :param problem: of commands that are held, with a FOPDT structure.
-    :param sign: of the gain, 1 or -1; 0: not known.
-    :return: None: none explains as much as two numbers do in white noise.
-    """
-    few = coarse(problem)
-    sent = np.concatenate([u.levels for u in problem.inputs if isinstance(u, PiecewiseConstant)])
-    _, *levels, _ = np.linspace(sent.min(), sent.max(), _LEVELS + 2).tolist()
-
-    def left(ends: tuple[float, float]) -> float:
-        ended = replace(few, ends=ends)
-        return max(evaluate(ended, start_fopdt(ended, sign)[0]).cost, NEGLIGIBLE**2)
-
-    none = (-math.inf, math.inf)
-    pairs = itertools.product((none[0], *levels), (*levels, none[1]))
-    costs = {e: left(e) for e in pairs if e[1] - e[0] > levels[1] - levels[0]}
-    ends = min(costs, key=costs.__getitem__)
-    n = few.time.size
-    gained = n * math.log(costs[none] / costs[ends])
-    return ends if gained > 2.0 * math.log(n) else None
+    return float(instants[int(np.argmin(remaining))])
 
 
 def needs_no_past(problem: Problem, sign: int) -> bool:

@@ -27,6 +27,11 @@ NEGLIGIBLE = 1e-10
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 # Range of a rest, in steps of the sensor, in which nothing moves.
 _A_STEP = 1.5
+# Instants at which a load is tried.
+_INSTANTS = 60
+# Least play, friction or shift of an end that counts, as a share of the command's range: the steps
+# of a sensor look like a tenth.
+_LEAST = 0.01
 
 
 @dataclass(frozen=True)
@@ -120,6 +125,23 @@ class Problem:
             for u, part in zip(self.inputs, self.experiments, strict=True)
         )
 
+    @cached_property
+    def levels(self) -> FloatArray:
+        """All levels of the commands that are held, ascending [u], shape (k,)."""
+        held = [u.levels for u in self.inputs if isinstance(u, PiecewiseConstant)]
+        return np.unique(np.concatenate([np.empty(0), *held]))
+
+    @cached_property
+    def least_command(self) -> float:
+        """Least play or friction that counts [u]; infinite for ramps, which show neither."""
+        return _LEAST * float(np.ptp(self.levels)) if self.levels.size else math.inf
+
+    @cached_property
+    def instants(self) -> FloatArray:
+        """Instants at which a load is tried, after the command's first change [s], shape (k,)."""
+        begin = max(float(self.inputs[0].times[0]), float(self.time[0]))
+        return np.linspace(begin, float(self.time[-1]), _INSTANTS + 2)[1:-1]
+
     @property
     def _further(self) -> tuple[str, ...]:
         """What has responses of its own after the model's, a name for each, in their order."""
@@ -171,6 +193,31 @@ class Problem:
         gain = float(coefficients[0]) or math.nan
         low, high = coefficients[self.places("ends")] / gain
         return self.ends[0] + float(low), self.ends[1] + float(high)
+
+    def moved(self, coefficients: FloatArray) -> Problem:
+        """Return the problem with its load and ends where a fit says that they are.
+
+        It is this one where they are there already, and where the ends would cross.
+
+        :param coefficients: of a fit, shape (k,).
+        """
+        problem = self
+        if self.load is not None:
+            step, shifts = coefficients[self.places("load")]
+            shift = -float(shifts / step) * self.shortest if step else 0.0
+            if abs(shift) >= self.shortest:
+                first, second, *_, last = self.instants.tolist()
+                shift = min(max(shift, first - second), second - first)
+                problem = replace(problem, load=min(max(self.load + shift, first), last))
+        if self.ends is not None:
+            low, high = self.ends_of(coefficients)
+            # An end that no command comes to is none.
+            low = low if low > self.levels[0] else -math.inf
+            high = high if high < self.levels[-1] else math.inf
+            near = np.allclose((low, high), self.ends, rtol=0.0, atol=self.least_command)
+            if low < high and not near:
+                problem = replace(problem, ends=(low, high))
+        return problem
 
     def play_of(self, coefficients: FloatArray) -> float:
         """Return the command that a reversal loses in the play [u]; 0: not estimated.
@@ -275,14 +322,14 @@ class Problem:
             # The level before is that of a step at the first sample, with the same response.
             yield pulse(float(self.time[part][0]))
         if self.unequal:
-            yield _folded(u)
+            yield distance(u, middle_of(u))
         if self.play:
             yield _turns(u)
         if self.load is not None:
             yield from (pulse(self.load, length) for length in (math.inf, self.shortest))
         if self.ends is not None:
             low, high = self.ends
-            yield from (_changed(u, lambda x: x < low), _changed(u, lambda x: x > high))
+            yield from (_changed(u, lambda x: x < low), is_above(u, high))
 
     def line(self, time: FloatArray) -> FloatArray:
         """Return the offset and, where estimated, the drift of one experiment, shape (1 or 2, n).
@@ -363,6 +410,11 @@ def _clipped(u: Input, ends: tuple[float, float] | None) -> Input:
     return u if ends is None else _changed(u, lambda x: np.clip(x, *ends))
 
 
+def is_above(u: Input, level: float) -> PiecewiseConstant:
+    """Return 1 while a held command is above a level, less what it is at first."""
+    return _changed(u, lambda x: x > level)
+
+
 def middle_of(u: Input) -> float:
     """Return the command above and below which effects may differ [u].
 
@@ -373,9 +425,9 @@ def middle_of(u: Input) -> float:
     return u.initial if low < u.initial < high else 0.5 * (low + high)
 
 
-def _folded(u: Input) -> PiecewiseConstant:
-    """Return how much farther from its middle a held command is than at first."""
-    return _changed(u, lambda x: np.abs(x - middle_of(u)))
+def distance(u: Input, level: float) -> PiecewiseConstant:
+    """Return how much farther from a level a held command is than at first [u]."""
+    return _changed(u, lambda x: np.abs(x - level))
 
 
 def _turns(u: Input) -> PiecewiseConstant:

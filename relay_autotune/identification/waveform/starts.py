@@ -16,12 +16,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.identification.waveform.problem import Problem, pulse
+from relay_autotune.identification.waveform.problem import (
+    NEGLIGIBLE,
+    Problem,
+    distance,
+    is_above,
+    pulse,
+)
 from relay_autotune.identification.waveform.rational import columns_of, free_motion, unit_steps
 from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Trial,
     evaluate,
+    information_criterion,
+    left_of,
     predicted_cost,
     refine,
 )
@@ -141,6 +149,9 @@ _SWITCH = 0.25
 # of squares up to which all samples decide between them.
 _SAME = 0.02
 _UNDECIDED = 1.05
+
+# Levels at which an actuator may end, and lags of which any process is about a sum.
+_LEVELS, _LAGS = 9, 8
 
 # Dead times tried at the start, as shares of the longest one.
 # Noise may make a relay switch faster than the process answers, hence those beyond 1.
@@ -333,6 +344,57 @@ def _costs(
     power[power == 0.0] = 1.0
     refused = dead_times > np.minimum(np.where(along < 0.0, *latest), problem.latest)
     return np.asarray(total - np.where(refused, 0.0, along**2 / power))
+
+
+def likeliest_ends(problem: Problem) -> tuple[float, float] | None:
+    """Return the levels at which an actuator ends, as few samples tell without a structure.
+
+    All pairs of some levels are tried. What an actuator makes of a command u is ``(|u - low| -
+    |u - high|)/2``, with u in place of an infinite one, and the process is the best sum of several
+    lags behind one dead time: one lag alone misses more than ends explain. Each end may be off its
+    level, to first order. Between ends that are nearer than the levels, an actuator is a switch,
+    and none are taken.
+
+    :param problem: of commands that are held, with a FOPDT structure.
+    :return: None: that it follows all is likeliest, by Schwarz's criterion.
+    """
+    few, (shortest, longest) = problem.thinned(_GRID_SAMPLES, scattered=True), time_scales(problem)
+    taus = np.geomspace(0.5 * min(shortest, 0.1 * longest), 30.0 * longest, _LAGS)
+    dead_times = longest * np.array(_SHARES[:14:2])
+    levels = np.linspace(problem.levels[0], problem.levels[-1], _LEVELS + 2)[1:-1].tolist()
+    ends = (-math.inf, *levels, math.inf)
+    measured, answers = [], []
+    for part, u, (command, *_) in zip(few.experiments, few.inputs, few.delayed, strict=True):
+        time = few.time[part]
+        moved = time - dead_times[:, None]
+        of_levels = (of(u, level) for of in (distance, is_above) for level in levels)
+        inputs = (command, *of_levels)
+        every = [
+            shifted_columns(few.structure, np.array((math.log(tau), 0.0)), moved, each)[0]
+            for tau in taus
+            for each in inputs
+        ]
+        left = left_of(np.concatenate((few.y[part][None], *every)), few.line(time))
+        measured.append(left[0])
+        answers.append(left[1:].reshape(_LAGS, len(inputs), dead_times.size, time.size))
+    y, rows = np.concatenate(measured), np.concatenate(answers, axis=-1).swapaxes(0, 2)
+
+    def score(pair: tuple[int, int]) -> float:
+        low, high = (at % (_LEVELS + 1) for at in pair)
+        finite = [at for at in (low, high) if at]
+        costs = []
+        # Of each dead time, the answers to all inputs, one for each lag.
+        for of in rows:
+            felt = 0.5 * (of[low] + (-of[high] if high else of[0]))
+            gains = np.linalg.lstsq(felt.T, y, rcond=None)[0]
+            shifts = (gains @ of[_LEVELS + at] for at in finite)
+            costs.append(float(np.sum(left_of(y, np.stack((*felt, *shifts))) ** 2)))
+        return information_criterion(min(costs), y.size, len(finite), y.size * NEGLIGIBLE**2)
+
+    pairs = itertools.combinations(range(_LEVELS + 2), 2)
+    apart = (p for p in pairs if p[1] - p[0] > 1 or p[0] == 0 or p[1] > _LEVELS)
+    low, high = min(apart, key=score)
+    return (ends[low], ends[high]) if high - low <= _LEVELS else None
 
 
 def shifted_columns(
