@@ -85,6 +85,22 @@ def test_an_actuator_that_ends_is_found_in_what_its_controller_sent(ends):
     assert np.isfinite(found.ends).any() == (ends != (-100.0, 100.0))
 
 
+def test_ends_are_found_where_the_controller_is_beyond_them_most_of_the_time():
+    """They were not, and the gains were trusted with three times the ultimate gain."""
+    process = SOPDT.of_fields(gain=2.5, time_constants=[34.0, 12.0], dead_time=7.3)
+    plant = VirtualProcess(process, disturbances=Disturbances(noise_std=0.1), seed=5)
+    controller, rows = PidController(Controller(0.89, 36.6), 0.0), []
+    for t in np.arange(0.0, 820.0, 1.7):
+        y = plant.measure(t)
+        rows.append((t, y, controller.step(t, 9.3 if 34.0 < t < 465.0 else 0.0, y)))
+        plant.command(float(np.clip(rows[-1][-1], -0.34, 4.22)))
+    time, measured, sent = np.array(rows).T
+    assert np.mean((sent < -0.34) | (sent > 4.22)) > 0.6
+    found = identify(Record(time, measured, sent))
+    assert found.ends == pytest.approx((-0.34, 4.22), abs=0.1)
+    assert found.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.05)
+
+
 def test_a_dead_zone_is_the_lower_end_of_what_is_answered():
     """It was trusted with four fifths of the gain."""
     time = np.arange(400) * 1.0

@@ -41,7 +41,8 @@ _DECAY = 3.0
 # Ratios of the powers of difference and noise, of which the most likely one is taken.
 _RATIOS = np.concatenate(([0.0], np.geomspace(1e-3, 1e12, 61)))
 _TURNS = 2
-# Length of a piece with a drift of its own, times w_u, and least number of its samples.
+# Length of a piece with a drift of its own, times w_u, about ten periods of the loop, and least
+# number of its samples.
 _A_PIECE, _LEAST_PIECE = 60.0, 8
 # Largest factor of an ultimate point from the model's, and frequencies at which it is sought.
 _FAR, _NEAR = 4.0, 241

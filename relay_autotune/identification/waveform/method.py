@@ -76,7 +76,8 @@ _MOST_LATE, _DIVIDED = 0.05, 0.5
 # standard deviations of the noise and as a share of the range; samples that show whether the model
 # moves on.
 _STILL_NOISE, _STILL, _FEW = 3.0, 0.02, 500
-# Odds of a response, as a score, from which it is not sought a second time.
+# Odds of a response, as a score, from which it is not sought a second time, which takes as long as
+# the first.
 _OVERWHELMING = 200.0
 # Ratio of two records' noise up to which they count as equal.
 _ALIKE = 1.2

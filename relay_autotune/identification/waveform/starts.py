@@ -374,7 +374,11 @@ def likeliest_ends(problem: Problem) -> tuple[float, float] | None:
             for tau in taus
             for each in inputs
         ]
-        left = left_of(np.concatenate((few.y[part][None], *every)), few.line(time))
+        line = few.line(time)
+        seen = np.concatenate((few.y[part][None], *every, line))
+        if few.colour is not None:
+            seen = few.colour.whitened(seen)
+        left = left_of(seen[: -len(line)], seen[-len(line) :])
         measured.append(left[0])
         answers.append(left[1:].reshape(_LAGS, len(inputs), dead_times.size, time.size))
     y, rows = np.concatenate(measured), np.concatenate(answers, axis=-1).swapaxes(0, 2)
