@@ -79,6 +79,9 @@ TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "ends", "fric
 _HIDDEN = frozenset(("drift", "relaxation", "past", "ends"))
 # Steps of a fit with a further term or in another colour, and how often a load and ends are moved.
 _STEPS, _MOVES = 15, 4
+# Ratio of a FOPDT's sum of squares to that of a richer structure, from which that is more than an
+# imitation of it.
+_RICHER = 1.01
 
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
 # zero of a slower inverse response as a drift.
@@ -337,10 +340,10 @@ class FitContext:
         """
         beside = replace(problem, structure=FOPDT)
         fopdt = self._fopdt_of(beside)
-        if fopdt.cost >= state.cost:
-            return state
         if problem.structure == FOPDT:
-            return fopdt
+            return min(state, fopdt, key=lambda s: s.cost)
+        if fopdt.cost >= _RICHER * state.cost:
+            return state
         starts = self._starts(Guess.of(beside, fopdt), problem.structure)
         return min(state, best_of(problem, starts), key=lambda s: s.cost)
 
