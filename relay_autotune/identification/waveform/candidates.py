@@ -331,7 +331,7 @@ class FitContext:
         return likeliest_ends(self.problem)
 
     def _out_of_a_wrong_minimum(self, problem: Problem, state: Trial) -> Trial:
-        """Return a fit with a further term, begun anew where a FOPDT explains more.
+        """Return a fit with a further term, begun anew where a FOPDT explains as much.
 
         Without the term, a dead time or a lag may have stood for it.
 

@@ -164,7 +164,8 @@ def chosen_fit(
     if not fits:
         raise no_response(known)
     # Before a jump or without spikes the best simulation may: it shows these.
-    best = next((f for f in fits if odds_of_response(f.problem, f.state) > ANSWERED), fits[-1])
+    *first, last = fits
+    best = next((f for f in first if odds_of_response(f.problem, f.state) > ANSWERED), last)
     plain = next((c for c in own if c.structure == FOPDT), None)
     if plain is None or best.problem.structure == FOPDT:
         return best

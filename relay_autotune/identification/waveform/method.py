@@ -158,7 +158,11 @@ def _beside(records: Sequence[Record], fit: Fit) -> Identification | None:
 
 
 def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held: bool) -> Fit:
-    """Fit, again with each experiment weighted by its noise, and again without spikes."""
+    """Fit, again with each experiment weighted by its noise, and again without spikes.
+
+    In open loop all of it is done again from a slow disturbance on where little speaks for a
+    response. Either search fails by showing none.
+    """
 
     def chosen(samples: Problem, among: Sequence[str] = TRIED, before: Fit | None = None) -> Fit:
         return chosen_fit(samples, known, sign, scale, held=held, among=among, before=before)

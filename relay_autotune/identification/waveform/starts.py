@@ -286,7 +286,7 @@ def start_fopdt(problem: Problem, sign: int = 0) -> list[FloatArray]:
     """
     shortest, longest = time_scales(problem)
     few = problem.thinned(_GRID_SAMPLES, scattered=True)
-    taus = np.geomspace(0.5 * min(shortest, 0.1 * longest), 30.0 * longest, 14)
+    taus = _lags(shortest, longest, 14)
     dead_times = longest * np.array(_SHARES)
     latest = latest_dead_times(problem, sign)
     costs = np.array([_costs(few, tau, dead_times, latest) for tau in taus])
@@ -299,6 +299,11 @@ def start_fopdt(problem: Problem, sign: int = 0) -> list[FloatArray]:
         if len(best) == _BEST:
             break
     return best
+
+
+def _lags(shortest: float, longest: float, count: int) -> FloatArray:
+    """Return lags that span what a record may show, each a multiple of the one before [s]."""
+    return np.geomspace(0.5 * min(shortest, 0.1 * longest), 30.0 * longest, count)
 
 
 def _apart(a: FloatArray, b: FloatArray) -> bool:
@@ -359,7 +364,7 @@ def likeliest_ends(problem: Problem) -> tuple[float, float] | None:
     :return: None: that it follows all is likeliest, by Schwarz's criterion.
     """
     few, (shortest, longest) = problem.thinned(_GRID_SAMPLES, scattered=True), time_scales(problem)
-    taus = np.geomspace(0.5 * min(shortest, 0.1 * longest), 30.0 * longest, _LAGS)
+    taus = _lags(shortest, longest, _LAGS)
     dead_times = longest * np.array(_SHARES[:14:2])
     levels = np.linspace(problem.levels[0], problem.levels[-1], _LEVELS + 2)[1:-1].tolist()
     ends = (-math.inf, *levels, math.inf)
