@@ -20,7 +20,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, EXPERIMENT_METADATA, FLOAT64
 from relay_autotune.bag.limits import LARGEST_VALUE
-from relay_autotune.bag.reader import is_text, opened
+from relay_autotune.bag.reader import is_text, opened, paths_of
 from relay_autotune.bag.signals import Selection, Signal
 from relay_autotune.bag.topics import Progress, Topics
 from relay_autotune.errors import BagError, RecordError, SelectionError
@@ -77,7 +77,7 @@ def read_experiments(
     :raises SelectionError: if the selection does not fit, or more than one pair does.
     :raises BagError: if the recording cannot be read, or holds nothing to identify from.
     """
-    paths = [Path(path)] if isinstance(path, Path | str) else [Path(part) for part in path]
+    paths = paths_of(path)
     path, wanted = paths[0], selection or Selection()
     if len(paths) > 1 and any(map(is_text, paths)):
         raise SelectionError("CSV files cannot be joined to one timeline; expected bags")

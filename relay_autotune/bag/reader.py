@@ -43,7 +43,7 @@ def read(
     :raises SelectionError: if there is no such column.
     :raises BagError: if the recording cannot be read.
     """
-    paths = [Path(path)] if isinstance(path, Path | str) else [Path(part) for part in path]
+    paths = paths_of(path)
     if is_text(paths[0]):
         # Imported here: it is not needed for a bag.
         from relay_autotune.bag.csv_file import read_columns
@@ -51,6 +51,22 @@ def read(
         return read_columns(paths[0], columns)
     with opened(paths, clock) as topics:
         return {name: timed.signal for name, timed in topics.signals(columns).items()}
+
+
+def paths_of(given: Path | str | Sequence[Path | str]) -> list[Path]:
+    """Return the paths of a recording, at least one.
+
+    :param given: one path, or several.
+    :raises BagError: if it is something else.
+    """
+    parts = [given] if isinstance(given, Path | str) else given
+    try:
+        paths = [Path(part) for part in parts]
+    except TypeError:
+        paths = []
+    if not paths:
+        raise BagError(f"a recording is read from its path, a text, found {given!r:.80}")
+    return paths
 
 
 @contextmanager

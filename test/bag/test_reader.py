@@ -677,6 +677,13 @@ def test_one_function_reads_columns_of_a_bag_and_of_a_text():
         read(text, ["temperature"])
 
 
+@pytest.mark.parametrize("given", [None, 3, [], [None], b"log.csv"])
+def test_what_is_no_path_gets_a_sentence(given):
+    for function in (read, read_records):
+        with pytest.raises(BagError, match="is read from its path, a text, found"):
+            function(given)
+
+
 def test_the_readme_of_the_reader_runs(capsys, monkeypatch):
     page = (REPOSITORY / "relay_autotune" / "bag" / "README.md").read_text()
     monkeypatch.chdir(REPOSITORY)
