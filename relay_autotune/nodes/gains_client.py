@@ -36,7 +36,7 @@ from relay_autotune.nodes.loop_client import ANSWER_WITHIN, GoneError, LoopClien
 from relay_autotune.nodes.shell import prefix, ros_arguments
 from relay_autotune.nodes.tables import GAINS, rate_from, rate_of, sensor_parameters
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.reasons import may_pass
+from relay_autotune.reasons import Code, may_pass
 from relay_autotune.text import TOLD_EVERY, duration, visible
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, Verification
@@ -346,10 +346,12 @@ class GainsClient(LoopClient):
             result = made_visible(answer.result)
             if answer.status == GoalStatus.STATUS_SUCCEEDED:
                 return result
-            early = reason_from_message(result.why).code.row.transient
-            if not early or time.monotonic() - begun > ANSWER_WITHIN:
+            code = reason_from_message(result.why).code
+            if not code.row.transient or time.monotonic() - begun > ANSWER_WITHIN:
                 raise LoopError(f"{self.name} has not verified the gains: {result.reason}")
-            tell(f"waiting: {result.reason}")
+            # The gains that are offered reach the node a moment later.
+            if code is not Code.NONE_WAIT:
+                tell(f"waiting: {result.reason}")
             self.wait(leave, TOLD_EVERY)
         raise LoopError("the verification was ended before it began: the gains are as before")
 

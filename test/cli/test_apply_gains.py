@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from action_msgs.msg import GoalStatus
 
 from relay_autotune.cli import apply_gains, tune_loop
 from relay_autotune.cli.apply_gains import Entries, found_entries, verified
@@ -387,6 +388,26 @@ def test_what_a_node_allows_is_raised_until_the_end_of_a_block() -> None:
     with pytest.raises(GoneError), client.allowing(verify_step_max=2.0):
         raise GoneError("it hangs, and comes back")
     assert there == before
+
+
+def test_gains_that_are_on_their_way_to_the_node_are_no_reason_to_be_told() -> None:
+    reasons = [Code.NONE_WAIT(), Code.NO_CLOCK()]
+    client: Any = GainsClient.__new__(GainsClient)
+    client.name, client.wait = "/controller_node", lambda *_: None
+    client._sent = lambda *_: None
+
+    def ended(*_: object) -> Any:
+        result = Verify.Result(verdict=Verify.Result.PASSED)
+        if not reasons:
+            return SimpleNamespace(status=GoalStatus.STATUS_SUCCEEDED, result=result)
+        fill_reason(result.why, why := reasons.pop(0))
+        result.reason = str(why)
+        return SimpleNamespace(status=GoalStatus.STATUS_ABORTED, result=result)
+
+    client._ended = ended
+    told: list[str] = []
+    assert client._verified(Verify.Goal(), told.append, lambda: False).verdict
+    assert told == [f"waiting: {Code.NO_CLOCK()}"]
 
 
 def test_new_gains_that_could_not_be_taken_back_are_told_as_such(
