@@ -12,6 +12,7 @@ callbacks of the import system print and ignore it. Commands enable that excepti
 from __future__ import annotations
 
 import atexit
+import errno
 import gc
 import os
 import signal
@@ -55,7 +56,29 @@ def start(module: str, told_for: tuple[str, ...] = ()) -> int:
         # With pip alone there is no ROS; without its extras, neither what draws nor what records.
         sys.stderr.write(f"{name}: {_lacking(error)}\n")
         return 1
+    except OSError as error:
+        if not output_refused(name, error):
+            raise
+        return 1
     return status
+
+
+# A pipe without a reader; a disk, or what stands for one, that takes no more.
+_REFUSED = (errno.EPIPE, errno.ENOSPC, errno.EIO, errno.EDQUOT)
+
+
+def output_refused(program: str, error: Exception) -> bool:
+    """Tell whether standard output takes no more; then nothing is flushed to it at the end.
+
+    :param program: says so on standard error, unless the reader closed the pipe, as `head` does.
+    :param error: with which something was written.
+    """
+    if not isinstance(error, OSError) or error.errno not in _REFUSED:
+        return False
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if error.errno != errno.EPIPE:
+        sys.stderr.write(f"{program}: standard output cannot be written: {error.strerror}\n")
+    return True
 
 
 def _lacking(error: ModuleNotFoundError) -> str:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-import errno
 import importlib.util
 import math
 import os
@@ -28,6 +27,7 @@ from relay_autotune.errors import (
     defect,
 )
 from relay_autotune.quantities import Quantity
+from relay_autotune.start import output_refused
 from relay_autotune.text import visible
 
 DONE, NOTHING_FOUND, USAGE, DOUBTFUL = 0, 1, 2, 3
@@ -68,6 +68,13 @@ class Parser(argparse.ArgumentParser):
         super().__init__(program, formatter_class=Help, **others)
         # Without it -1e-3 is taken for an option.
         self._negative_number_matcher = _NEGATIVE
+
+    def print_help(self, file: Any = None) -> None:
+        """Print the help; an output that takes none is an error, which argparse would ignore.
+
+        :param file: to which it is written; None: standard output.
+        """
+        print(self.format_help(), end="", file=file, flush=True)
 
     def error(self, message: str) -> NoReturn:
         """Refuse the command line, and say where it is read what it takes.
@@ -142,22 +149,16 @@ def run_command(program: str, work: Callable[[], int]) -> int:
     except RelayAutotuneError as error:
         say(program, str(error))
         return NOTHING_FOUND
-    except BrokenPipeError:
-        # The reader closed the pipe, as `head` does; nothing may be flushed to it at the end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return NOTHING_FOUND
     except KeyboardInterrupt:
         return 130
     except ModuleNotFoundError:
         # The start of the executable says what to install.
         raise
     except Exception as error:
+        if output_refused(program, error):
+            return NOTHING_FOUND
         if os.environ.get(DEBUG):
             raise
-        if isinstance(error, OSError) and error.errno in _FULL:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            say(program, f"standard output cannot be written: {error.strerror}")
-            return NOTHING_FOUND
         say(program, f"stopped by {defect(error)}")
         return NOTHING_FOUND
     finally:
@@ -201,8 +202,6 @@ def guarded_in_graph(program: str, work: Callable[[ExitStack], int]) -> int:
     return status
 
 
-# A disk, or what stands for one, that takes no more.
-_FULL = (errno.ENOSPC, errno.EIO, errno.EDQUOT)
 _KINDS: dict[type, Callable[[str], Any]] = {int: int, float: finite}
 
 

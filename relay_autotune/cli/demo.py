@@ -18,8 +18,9 @@ from typing import Any
 
 from relay_autotune import threads  # noqa: F401  before numpy: live and replay are bit-equal
 from relay_autotune.analysis import analyse
+from relay_autotune.cli.arguments import run_command
 from relay_autotune.cli.own_nodes import OwnNodes, free_domain
-from relay_autotune.errors import RelayAutotuneError
+from relay_autotune.errors import RelayAutotuneError, system_says
 from relay_autotune.exchange.messages import stamp_nanoseconds
 from relay_autotune.exchange.models import document, model_fields, to_json
 from relay_autotune.nodes.shell import ros_arguments
@@ -53,7 +54,10 @@ class DemoError(RelayAutotuneError):
 
 def main() -> int:
     """Run the demo; leave bag, result, picture and report in ``demo_output/``."""
-    output = Path("demo_output")
+    return run_command("demo", partial(_demonstrate, Path("demo_output")))
+
+
+def _demonstrate(output: Path) -> int:
     try:
         if output.exists():
             shutil.rmtree(output)
@@ -65,12 +69,13 @@ def main() -> int:
         for left in (output / "records", output / "log"):
             shutil.rmtree(left, ignore_errors=True)
         return _finish(output, seen)
-    except (RelayAutotuneError, OSError) as error:
-        print(f"demo: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("demo: interrupted", file=sys.stderr)
-        return 130
+    except OSError as error:
+        if error.filename is None:
+            raise
+        raise DemoError(
+            f"{error.filename} cannot be written: {system_says(error)}; run the demo where you "
+            "may write"
+        ) from error
 
 
 def _run(output: Path, domain: int) -> tuple[Path, Any]:

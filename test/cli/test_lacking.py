@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the executables say where a package is not installed, as with pip alone."""
+"""What the executables say where a package, or room for what they write, is lacking."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from relay_autotune.cli import demo
 
 ROOT = Path(__file__).resolve().parents[2]
 BAG = str(ROOT / "bags/biased_relay")
@@ -48,3 +50,24 @@ def test_the_help_of_csv_to_bag_needs_no_package_for_bags() -> None:
     done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert "--measurement-topic" in done.stdout
+
+
+@pytest.mark.parametrize("name", ["identify", "tune_loop", "plant_node"])
+def test_a_help_that_cannot_be_written_is_told_and_is_no_success(name) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", WITHOUT.format([], name), "--help"],
+            stdout=full, stderr=subprocess.PIPE, text=True, timeout=60,
+        )  # fmt: skip
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.endswith("standard output cannot be written: No space left on device")
+
+
+def test_the_demo_tells_that_it_cannot_write_its_folder(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("demo_output").write_text("a file, which is no folder to be emptied")
+    assert demo.main() == 1
+    assert capsys.readouterr().err == (
+        "demo: demo_output cannot be written: Not a directory; run the demo where you may write\n"
+    )
