@@ -5,6 +5,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import sys
 import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -143,6 +146,24 @@ def system_says(error: Exception) -> str:
     :param error: of the system, or another one.
     """
     return getattr(error, "strerror", None) or str(error)
+
+
+# A pipe without a reader; a disk, or what stands for one, that takes no more.
+_REFUSED = (errno.EPIPE, errno.ENOSPC, errno.EIO, errno.EDQUOT)
+
+
+def output_refused(program: str, error: Exception) -> bool:
+    """Tell whether standard output takes no more; then nothing is flushed to it at the end.
+
+    :param program: says so on standard error, unless the reader closed the pipe, as `head` does.
+    :param error: with which something was written.
+    """
+    if not isinstance(error, OSError) or error.errno not in _REFUSED:
+        return False
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if error.errno != errno.EPIPE:
+        sys.stderr.write(f"{program}: standard output cannot be written: {error.strerror}\n")
+    return True
 
 
 T = TypeVar("T")

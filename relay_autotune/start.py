@@ -12,7 +12,6 @@ callbacks of the import system print and ignore it. Commands enable that excepti
 from __future__ import annotations
 
 import atexit
-import errno
 import gc
 import os
 import signal
@@ -20,6 +19,8 @@ import sys
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
+
+from relay_autotune.errors import output_refused
 
 
 def start(module: str, told_for: tuple[str, ...] = ()) -> int:
@@ -61,24 +62,6 @@ def start(module: str, told_for: tuple[str, ...] = ()) -> int:
             raise
         return 1
     return status
-
-
-# A pipe without a reader; a disk, or what stands for one, that takes no more.
-_REFUSED = (errno.EPIPE, errno.ENOSPC, errno.EIO, errno.EDQUOT)
-
-
-def output_refused(program: str, error: Exception) -> bool:
-    """Tell whether standard output takes no more; then nothing is flushed to it at the end.
-
-    :param program: says so on standard error, unless the reader closed the pipe, as `head` does.
-    :param error: with which something was written.
-    """
-    if not isinstance(error, OSError) or error.errno not in _REFUSED:
-        return False
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    if error.errno != errno.EPIPE:
-        sys.stderr.write(f"{program}: standard output cannot be written: {error.strerror}\n")
-    return True
 
 
 def _lacking(error: ModuleNotFoundError) -> str:

@@ -25,9 +25,9 @@ from relay_autotune.errors import (
     RelayAutotuneError,
     SelectionError,
     defect,
+    output_refused,
 )
 from relay_autotune.quantities import Quantity
-from relay_autotune.start import output_refused
 from relay_autotune.text import visible
 
 DONE, NOTHING_FOUND, USAGE, DOUBTFUL = 0, 1, 2, 3
