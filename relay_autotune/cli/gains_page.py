@@ -280,5 +280,4 @@ def _document(step: Any) -> dict[str, Any]:
         "name": f"step of the {what} by {step.step:+g} {'y' if setpoint else 'u'}",
         "measurement": curve(step.time, step.measurement),
         "predicted": curve(step.time, step.predicted),
-        "command": curve(step.time, step.command),
     }

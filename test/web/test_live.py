@@ -339,7 +339,7 @@ def test_on_a_phone_a_wish_shows_what_comes_of_it_and_a_model_stands_once(tmp_pa
     live = Live("/relay_node")
     live.tell(proves=True, process="1 / (1 + s)")
     curve = [[0.0, 1.0], [0.0, 1.0]]
-    step = {"name": "set-point step", "passed": True, "measurement": curve, "predicted": curve}
+    step = {"name": "set-point step", "measurement": curve, "predicted": curve}
     live.show("proof", [step])
     live.tell(proof=(("verdict", "passed"),))
     with served([subject_of(analysed())], live=live) as url, Chromium(tmp_path) as browser:
@@ -348,6 +348,8 @@ def test_on_a_phone_a_wish_shows_what_comes_of_it_and_a_model_stands_once(tmp_pa
         tab.go(url)
         tab.wait("!document.querySelector('#prove').disabled")
         tab.wait("document.querySelectorAll('#plot-proof .curve').length === 2")
+        said = tab.eval("document.querySelector('#plot-proof svg').getAttribute('aria-label')")
+        assert said == "Verification: measured and predicted: set-point step"
         # the model is that of the experiment below
         assert tab.text("#process")
         assert not tab.eval("document.querySelector('#live-process').checkVisibility()")

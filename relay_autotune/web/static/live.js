@@ -333,7 +333,7 @@ export class Live {
     const [step] = steps;
     this.proof.draw({
       curves: [curve(step.measurement, "measured", "measured"), curve(step.predicted, "model", "predicted")],
-      said: `${step.name}, ${step.passed ? "as predicted" : "not as predicted"}`,
+      said: step.name,
     });
   }
 
