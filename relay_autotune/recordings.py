@@ -46,13 +46,11 @@ from relay_autotune.text import is_unit
 class Recording:
     """What was found in one recording.
 
-    :param path: as it was given.
     :param experiments: the records, at least one.
     :param notes: what to know about it, each a sentence.
     :param of_one_process: whether they are parts of one measurement and one command.
     """
 
-    path: Path
     experiments: tuple[Record, ...]
     notes: tuple[str, ...] = ()
     of_one_process: bool = False
@@ -100,7 +98,7 @@ def read_experiments(
         parts = tuple(p for r in records for p in window(r, wanted.start, wanted.end))
     # Those of relay_node may be of several loops, and tell of themselves how they ended.
     of_one = all(record.outcome is Outcome.UNKNOWN for record in records)
-    return Recording(path, parts, tuple(notes), of_one)
+    return Recording(parts, tuple(notes), of_one)
 
 
 _HEADER: dict[str, Any] = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}

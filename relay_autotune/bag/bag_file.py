@@ -512,7 +512,7 @@ class SqliteFile(BagFile):
                     if sought <= MOST_SOUGHT:
                         definitions[kind] = ("ros2msg", find_definition(kind).text.encode())
             form, text = definitions[kind]
-            channels[number] = Channel(number, name, kind, encoding, form, text, {})
+            channels[number] = Channel(number, name, kind, encoding, form, text)
         return channels
 
     def _rows(self, query: str) -> Iterator[tuple[Any, ...]]:

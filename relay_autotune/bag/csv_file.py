@@ -17,7 +17,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -483,16 +482,8 @@ def _time(path: Path, names: Sequence[str], wanted: Selection, taken: Sequence[i
     return called_so[0] if called_so and not is_time(names[0]) else 0
 
 
-class _Pair(NamedTuple):
-    """Columns that may be measurement and command, and whether both are named so."""
-
-    measurement: str
-    command: str
-    named: bool
-
-
-def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[_Pair]:
-    """Return each pair of columns that may be measurement and command.
+def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[tuple[str, str, bool]]:
+    """Return columns that may be measurement and command, and whether both are named so.
 
     :param names: of the columns that are free.
     :param given: measurement and command, as far as they are named.
@@ -505,9 +496,9 @@ def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[_Pair]:
         [name] if name is not None else hinted or unclear
         for name, hinted in zip(given, hints, strict=True)
     ]
-    found = [_Pair(y, u, all(hints)) for y in pair[0] for u in pair[1] if y != u]
+    found = [(y, u, all(hints)) for y in pair[0] for u in pair[1] if y != u]
     # Of a plant's columns, those of one loop belong together.
-    of_one = [each for each in found if tag_of(each.measurement) == tag_of(each.command) != ""]
+    of_one = [each for each in found if tag_of(each[0]) == tag_of(each[1]) != ""]
     return (of_one or found)[:_MOST_CHOICES]
 
 

@@ -85,7 +85,6 @@ class Channel:
     :param encoding: of the messages, such as ``cdr``.
     :param schema_encoding: such as ``ros2msg``.
     :param definition: text of the schema.
-    :param metadata: what the recorder noted, such as QoS.
     """
 
     id: int
@@ -94,7 +93,6 @@ class Channel:
     encoding: str
     schema_encoding: str
     definition: bytes
-    metadata: dict[str, str]
 
 
 _DECLARING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.STATISTICS)
@@ -112,7 +110,7 @@ class Declarations:
         self.message_counts: dict[int, int] | None = None
         self.contradictions: list[str] = []
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
-        self._channels: dict[int, tuple[str, int, str, dict[str, str]]] = {}
+        self._channels: dict[int, tuple[str, int, str]] = {}
         self._taken: set[tuple[int, bytes]] = set()
         self._size = 0
 
@@ -120,8 +118,8 @@ class Declarations:
     def channels(self) -> dict[int, Channel]:
         """The channels by their ids, each with its type, wherever that is declared."""
         return {
-            number: Channel(number, topic, name, encoding, schema_encoding, definition, metadata)
-            for number, (topic, schema, encoding, metadata) in self._channels.items()
+            number: Channel(number, topic, name, encoding, schema_encoding, definition)
+            for number, (topic, schema, encoding) in self._channels.items()
             for name, schema_encoding, definition in [self._schemas.get(schema, ("", "", b""))]
         }
 
@@ -129,7 +127,7 @@ class Declarations:
     def have_all_types(self) -> bool:
         """True if the type of each channel is declared; 0 stands for a channel without a type."""
         return all(
-            schema in self._schemas or schema == 0 for _, schema, *_ in self._channels.values()
+            schema in self._schemas or schema == 0 for _, schema, _ in self._channels.values()
         )
 
     @staticmethod
@@ -187,10 +185,9 @@ class Declarations:
         elif opcode == Opcode.CHANNEL:
             number, schema_number = unsigned(body, 0, "<H"), unsigned(body, 2, "<H")
             topic, at = text(body, 4)
-            encoding, at = text(body, at)
-            metadata, _ = map_of_text(body, at)
-            first = self._channels.setdefault(number, (topic, schema_number, encoding, metadata))
-            if first[:3] != (topic, schema_number, encoding):
+            channel = (topic, schema_number, text(body, at)[0])
+            first = self._channels.setdefault(number, channel)
+            if first != channel:
                 self.contradictions.append(
                     f"channel {number} is declared as {first[0]} and, differently, as {topic}"
                 )

@@ -227,11 +227,6 @@ class BagWriter:
     def __exit__(self, *raised: object) -> None:
         self.close()
 
-    @property
-    def file(self) -> Path:
-        """The MCAP file."""
-        return self.path / self._file_name
-
     def write(self, topic: str, log_time_ns: int, publish_time_ns: int, cdr: bytes) -> None:
         """Add a message to the recording; it is safe after the next `flush`.
 

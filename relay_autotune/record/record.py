@@ -292,13 +292,11 @@ def _as_column(name: str, value: object, length: int | None) -> FloatArray:
 class Unthinned:
     """Properties of a record before its samples were averaged in blocks.
 
-    :param samples: number of samples.
-    :param interval: median time between them [s].
+    :param interval: median time between its samples [s].
     :param noise: standard deviation of the noise of each [y].
     :param remark: what was done, a sentence.
     """
 
-    samples: int
     interval: float
     noise: float
     remark: str

@@ -71,7 +71,6 @@ def thinned(record: Record) -> Record:
         part,
         begins,
         Unthinned(
-            n,
             record.interval,
             record.noise_std if record.noise_std > 0.0 else roughness(record.measurement),
             f"of {n} samples {begins.size} are used{means}{said}",

@@ -43,7 +43,7 @@ class Kind:
         self.name, text = f"x_msgs/msg/{name}", DEFINITIONS[f"x_msgs/msg/{name}"]
         self.store = get_typestore(Stores.EMPTY)
         self.store.register(get_types_from_msg(text, self.name))
-        self.root = message_type(Channel(1, "/t", self.name, "cdr", "ros2msg", text.encode(), {}))
+        self.root = message_type(Channel(1, "/t", self.name, "cdr", "ros2msg", text.encode()))
 
     def make(self, *values, kind=""):
         return self.store.types[f"x_msgs/msg/{kind}" if kind else self.name](*values)
@@ -276,7 +276,7 @@ def test_a_message_that_claims_millions_of_names_is_given_up_soon():
 
 def test_names_beside_texts_of_unknown_length_are_refused_in_words():
     text = "float64[] values\nstring[] name\nwstring remark\n"
-    root = message_type(Channel(1, "/t", "x_msgs/msg/Wide", "cdr", "ros2msg", text.encode(), {}))
+    root = message_type(Channel(1, "/t", "x_msgs/msg/Wide", "cdr", "ros2msg", text.encode()))
     # Two values, two names that are the same; the remark cannot be decoded.
     values = (2).to_bytes(4, "little") + bytes(4) + np.array([1.0, 2.0]).tobytes()
     name = (2).to_bytes(4, "little") + b"a\0\0\0"

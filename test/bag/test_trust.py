@@ -501,7 +501,7 @@ def test_a_type_that_the_summary_lacks_is_found_among_the_data(tmp_path):
 
 def channel(text, encoding="ros2msg"):
     """Return a channel of a type x_msgs/msg/T of a definition."""
-    return Channel(1, "/t", "x_msgs/msg/T", "cdr", encoding, text.encode(), {})
+    return Channel(1, "/t", "x_msgs/msg/T", "cdr", encoding, text.encode())
 
 
 def doubling(depth, last):

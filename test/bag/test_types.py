@@ -403,7 +403,7 @@ def test_lines_that_are_no_field(line):
 
 
 def channel(type_name, text, schema_encoding="ros2msg", encoding="cdr"):
-    return Channel(1, "/t", type_name, encoding, schema_encoding, text.encode(), {})
+    return Channel(1, "/t", type_name, encoding, schema_encoding, text.encode())
 
 
 # --- definitions that make no sense
@@ -443,7 +443,7 @@ def test_definitions_that_make_no_sense(text, encoding, sentence):
 
 
 def test_definitions_that_are_no_text():
-    bad = Channel(1, "/t", "x/msg/A", "cdr", "ros2msg", b"float64 \xff", {})
+    bad = Channel(1, "/t", "x/msg/A", "cdr", "ros2msg", b"float64 \xff")
     with pytest.raises(BagError, match="it is not UTF-8"):
         message_type(bad)
 

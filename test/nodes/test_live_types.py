@@ -92,7 +92,7 @@ def test_a_type_that_is_not_installed_is_refused() -> None:
 def test_a_class_has_the_fields_of_its_definition(name: str) -> None:
     package, _, short = name.split("/")
     text = find_definition(name).text.encode()
-    recorded = message_type(Channel(1, "/t", name, "cdr", "ros2msg", text, {}))
+    recorded = message_type(Channel(1, "/t", name, "cdr", "ros2msg", text))
     assert struct_of(getattr(importlib.import_module(f"{package}.msg"), short)) == recorded
 
 
