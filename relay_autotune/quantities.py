@@ -330,20 +330,5 @@ def result_fields(kind: Any) -> tuple[ResultField, ...]:
     return tuple(ordered)
 
 
-def check_result(values: object, error: type[RelayAutotuneError], of: str) -> None:
-    """Refuse a result with a number outside of its declared range.
-
-    :param values: the result.
-    :param error: what to raise.
-    :param of: what the fields belong to, as in "of the gains".
-    :raises RelayAutotuneError: of that kind; the message names the field, the value and the range.
-    """
-    for each in result_fields(type(values)):  # type: ignore[arg-type]
-        if each.kind is float and not each.derived:
-            problem = each.problem(getattr(values, each.name))
-            if problem is not None:
-                raise error(f"{each.name} {of} {problem}")
-
-
 NORMAL_95 = 1.96
 """Half of the width of the 95 % interval of a normal estimate, in standard deviations."""

@@ -196,9 +196,9 @@ def guarded_in_graph(program: str, work: Callable[[ExitStack], int]) -> int:
         status = run_command(program, lambda: work(graph))
         if graph.joined:
             # Imported here, because other commands do not need ROS.
-            from relay_autotune.nodes.lifetime import LEAVE_WITHIN, end_within
+            from relay_autotune.nodes.lifetime import end_soon
 
-            end_within(LEAVE_WITHIN, status)
+            end_soon(status)
     return status
 
 

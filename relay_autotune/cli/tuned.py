@@ -262,7 +262,7 @@ class Proof:
             found = controller.prove(step, 0.0, patience, tell, leave, self._message)
             if found.verdict == found.PASSED:
                 # Without gains it would hold its command, wherever that is.
-                controller.let_settle(self._choice.settles, tell, "the loop goes back", leave)
+                controller.let_settle(self._choice.settles, tell, leave)
             steps = controller.steps_of(found)
         which = f"{gains_words(self._gains)}, at {time.strftime('%H:%M')}"
         return found, (("gains", which), *found_entries(found)), steps

@@ -27,7 +27,7 @@ import numpy as np
 from relay_autotune.arrays import ComplexArray
 from relay_autotune.errors import TuningError
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.quantities import check_result, derived, result_field
+from relay_autotune.quantities import derived, result_field, result_fields
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,11 @@ class Performance(StepFigures, Margins):
     measurement; without a sampling period the largest gain at any frequency."""
 
     def __post_init__(self) -> None:
-        check_result(self, TuningError, "of the gains")
+        for each in result_fields(type(self)):  # type: ignore[arg-type]
+            if each.kind is float and not each.derived:
+                problem = each.problem(getattr(self, each.name))
+                if problem is not None:
+                    raise TuningError(f"{each.name} of the gains {problem}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -323,18 +323,17 @@ class GainsClient(LoopClient):
         return [found[key] for key in stamps if key in found]
 
     def let_settle(
-        self, seconds: float, tell: Callable[[str], None], what: str, leave: Callable[[], bool]
+        self, seconds: float, tell: Callable[[str], None], leave: Callable[[], bool]
     ) -> None:
-        """Let the loop run.
+        """Let the loop go back after a proof.
 
         :param seconds: how long [s].
         :param tell: called each second with what is waited for.
-        :param what: is waited for.
         :param leave: returns True to stop waiting.
         """
         begun = time.monotonic()
         while (waited := time.monotonic() - begun) < seconds and not leave():
-            tell(f"{what}, {duration(waited)} of {duration(seconds)}")
+            tell(f"the loop goes back, {duration(waited)} of {duration(seconds)}")
             self.wait(leave, min(TOLD_EVERY, seconds - waited))
 
     def _verified(self, goal: Any, tell: Callable[[str], None], leave: Callable[[], bool]) -> Any:

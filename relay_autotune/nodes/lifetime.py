@@ -321,7 +321,7 @@ def run(
         node = create()
     except RelayAutotuneError as error:
         status = _refuse(name, str(error))
-        end_within(LEAVE_WITHIN, status)
+        end_soon(status)
         rclpy.try_shutdown()
         return status
     status = 1
@@ -331,7 +331,7 @@ def run(
             node.get_logger().warning(unknown)
         status = _serve(node, signals)
     finally:
-        end_within(LEAVE_WITHIN, status)
+        end_soon(status)
         node.destroy_node()
         rclpy.try_shutdown()
     return status
@@ -353,14 +353,13 @@ class _SignalEvent(ctypes.Structure):
 _SIGEV_THREAD = 2
 
 
-def end_within(seconds: float, status: int) -> None:
-    """End the process after a time, wherever it is then; to be called once all is in order.
+def end_soon(status: int) -> None:
+    """End the process within `LEAVE_WITHIN`, wherever it is; to be called once all is in order.
 
     The middleware may compute without end while it leaves the graph, in C code that holds the
     interpreter and blocks all signals. So a timer of the C library calls `_exit`, which needs
     neither.
 
-    :param seconds: how long the process may take to end by itself [s].
     :param status: its exit status then.
     """
     for output in (sys.stdout, sys.stderr):
@@ -373,7 +372,7 @@ def end_within(seconds: float, status: int) -> None:
     timer = ctypes.c_void_p()
     library.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer))
     # Interval and first expiry, each in seconds and nanoseconds.
-    whole, rest = divmod(round(seconds * 1e9), 1_000_000_000)
+    whole, rest = divmod(round(LEAVE_WITHIN * 1e9), 1_000_000_000)
     library.timer_settime(timer, 0, (ctypes.c_long * 4)(0, 0, whole, rest), None)
 
 
