@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 
 from relay_autotune.errors import visible as visible
@@ -114,6 +114,22 @@ def date_text(start: float) -> str:
         return f"{datetime.fromtimestamp(start, tz=UTC):%Y-%m-%d %H:%M:%S} UTC"
     except (OverflowError, ValueError, OSError):
         return f"{start:g} s after 1970"
+
+
+def apart(words: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Return what stands outside of ``--ros-args`` ... ``--`` on a command line, and what within.
+
+    :param words: of the command line.
+    """
+    own, ros = list[str](), list[str]()
+    within = False
+    for word in words:
+        if within and word == "--":
+            within = False
+            continue
+        within = within or word == "--ros-args"
+        (ros if within else own).append(word)
+    return own, ros
 
 
 # Of a node or a topic; a full name has a slash first.

@@ -237,7 +237,7 @@ def _log(
     for name, ordered in zip(names, values, strict=True):
         there = ~np.isnan(ordered)
         if not there.all():
-            gap = _longest_gap(time_ns[there])
+            gap = np.diff(time_ns[there]).max(initial=0)
             notes.append(
                 f"{np.count_nonzero(~there)} cells of the column {name!r} are empty and left out; "
                 f"the longest gap is {gap / 1e9:.6g} s"
@@ -401,10 +401,6 @@ def _recordings(time_ns: IntArray) -> list[int]:
         if min(before, end - at) >= _RESTART and before - behind >= _RESTART:
             bounds.append(at)
     return [*bounds, time_ns.size]
-
-
-def _longest_gap(time_ns: IntArray) -> int:
-    return int(np.diff(time_ns).max()) if time_ns.size > 1 else 0
 
 
 def _choose(

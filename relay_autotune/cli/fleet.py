@@ -160,7 +160,10 @@ class ResultsFile:
                 with new.open("w", newline="", encoding="utf-8") as file:
                     writer = csv.DictWriter(file, COLUMNS)
                     writer.writeheader()
-                    writer.writerows(map(_for_spreadsheets, self._rows()))
+                    writer.writerows(
+                        {n: cell(v) if isinstance(v, str) else v for n, v in row.items()}
+                        for row in self._rows()
+                    )
             else:
                 pyarrow = _pyarrow()
                 text, number = pyarrow.string(), pyarrow.float64()
@@ -194,10 +197,6 @@ def rows(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
             gains = experiment["gains"][experiment["recommended"]]
             row |= {name: gains[name] for name in _OF_GAINS}
         yield row
-
-
-def _for_spreadsheets(row: dict[str, Any]) -> dict[str, Any]:
-    return {n: cell(value) if isinstance(value, str) else value for n, value in row.items()}
 
 
 def _status(document: dict[str, Any]) -> int:

@@ -53,6 +53,7 @@ from relay_autotune.cli.tune_view import Shown, check_lines
 from relay_autotune.errors import SelectionError
 from relay_autotune.exchange.export import EXPORTS
 from relay_autotune.nodes.shell import prefix, typed_for_parameter
+from relay_autotune.text import apart
 
 if TYPE_CHECKING:
     from relay_autotune.cli.loops import Loop
@@ -64,7 +65,7 @@ _READY_WITHIN = 30.0
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
     given = list(sys.argv[1:] if args is None else args)
-    own, ros = _apart(given)
+    own, ros = apart(given)
     parser = _parser()
     options = parser.parse_args(own)
     options.typed = given
@@ -127,16 +128,6 @@ def _require_no_parameter(options: argparse.Namespace, ros: list[str]) -> None:
         if name not in FLAGS and not (options.measurement or options.joint):
             do = typed_for_parameter(node, name, value)
         raise SelectionError(f"{flag} {given} sets nothing in relay_node: {do}")
-
-
-def _apart(given: list[str]) -> tuple[list[str], list[str]]:
-    """Return the options of the command, and those that ROS understands."""
-    if "--ros-args" not in given:
-        return given, []
-    start = given.index("--ros-args")
-    rest = given[start:]
-    end = rest.index("--") if "--" in rest else len(rest)
-    return given[:start] + rest[end + 1 :], rest[:end]
 
 
 def _parser() -> Parser:

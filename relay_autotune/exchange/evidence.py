@@ -39,7 +39,6 @@ _LARGEST_ORDER = 30
 class ExperimentFacts:
     """What is known of one experiment.
 
-    :param experiment_id: its id.
     :param outcome: how it ended; UNKNOWN: it still runs, or it is not known.
     :param duration: of the record [s].
     :param frequency: of the oscillation [rad/s]; NaN: the record has none.
@@ -48,7 +47,6 @@ class ExperimentFacts:
     :param sign: sign of the process's gain that the relay assumed; 0: not known.
     """
 
-    experiment_id: str
     outcome: Outcome
     duration: float
     frequency: float = math.nan
@@ -67,7 +65,7 @@ class ExperimentFacts:
         sign, settings = 0, record.settings
         if settings is not None:
             sign = -1 if settings.reverse_acting else int(is_switched(record))
-        found = cls(record.experiment_id, record.outcome, record.duration, sign=sign)
+        found = cls(record.outcome, record.duration, sign=sign)
         if not (moved > 0.0 and swing > 0.0):
             return found
         frequency, answer, whole = *_fundamental(record), True

@@ -53,7 +53,7 @@ from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.nodes.parameters import unknown_parameters
 from relay_autotune.quantities import Quantity
 from relay_autotune.reasons import NONE, Code, Reason
-from relay_autotune.text import visible
+from relay_autotune.text import apart, visible
 
 # Messages further apart than this take the ordinary path [s].
 CLOSE = 0.002
@@ -285,7 +285,7 @@ def run(
     :return: exit status: 0 after a signal, 1 after an error, 2 for arguments it cannot take.
     """
     words = sys.argv[1:] if args is None else list(args)
-    own = _outside_of_ros(words)
+    own, _ = apart(words)
     if {"-h", "--help"} & set(own):
         # A pager may have been closed early.
         with suppress(BrokenPipeError):
@@ -382,19 +382,6 @@ def _refuse(name: str, why: str) -> int:
     with suppress(OSError):
         print(visible(f"{name}: {why}"), file=sys.stderr)
     return 2
-
-
-def _outside_of_ros(words: Sequence[str]) -> list[str]:
-    """Return what stands outside of ``--ros-args`` ... ``--``."""
-    own, within = list[str](), False
-    for word in words:
-        if word == "--ros-args":
-            within = True
-        elif within and word == "--":
-            within = False
-        elif not within:
-            own.append(word)
-    return own
 
 
 def _without_flag(words: Sequence[str]) -> list[str]:

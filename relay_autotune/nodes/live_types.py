@@ -67,7 +67,8 @@ def reader_of(type_name: str, field: str, parameter: str = "measurement_field") 
         steps = steps_of(struct_of(kind), field, type_name)
     except FieldError as error:
         raise ParameterError(f"{parameter}: {error}") from None
-    stamp = _header_stamp if hasattr(kind(), "header") else None
+    stamped = hasattr(kind(), "header")
+    stamp = (lambda message: stamp_nanoseconds(message.header.stamp)) if stamped else None
     return Reader(kind, type_name, reading(steps), stamp)
 
 
@@ -124,10 +125,6 @@ def _type_of(slot: Any) -> Type:
     if isinstance(slot, definition.AbstractGenericString):
         return Text(wide=isinstance(slot, definition.AbstractWString))
     return NUMBERS[_PLAIN.get(slot.typename, slot.typename)]
-
-
-def _header_stamp(message: Any) -> int:
-    return stamp_nanoseconds(message.header.stamp)
 
 
 class CommandMessage:

@@ -275,7 +275,7 @@ class OwnResults(ResultCheck):
         # Gains that arrived before their model.
         self._early: tuple[str, Any] | None = None
         # Of the running experiment: its id and number of switches, its facts, its swing [y].
-        self._so_far = ("", 0), ExperimentFacts("", Outcome.UNKNOWN, 0.0), math.nan
+        self._so_far = ("", 0), ExperimentFacts(Outcome.UNKNOWN, 0.0), math.nan
 
     def take(
         self, name: str, message: Any, running: Session | None, on_setpoint: bool

@@ -61,7 +61,9 @@ def ms_on_each(law: ControlLaw, models: ModelSet) -> FloatArray:
         end = np.array([1j * math.pi / law.period])
         limits = (law(end) * models(end))[0].real
     else:
-        limits = np.array([_at_infinity(law, model) for model in models.models])
+        limits = np.array(
+            [0.0 if m.dead_time else at_infinity(law.characteristic(m)[-1]) for m in models.models]
+        )
     integrators = models.integrators + (1 if law.i else 0)
     count = winding(moved, w, models.unstable_poles, integrators, limits, law.period)
     for k in np.flatnonzero(np.isnan(count)):
@@ -70,10 +72,6 @@ def ms_on_each(law: ControlLaw, models: ModelSet) -> FloatArray:
         known = models.errors is None or law.period > 0.0
         count[k] = loop.unstable_poles if known else math.inf
     return np.where(count == 0.0, 1.0 / np.abs(moved[1:]).min(axis=0), math.inf)
-
-
-def _at_infinity(law: ControlLaw, model: TransferFunction) -> float:
-    return 0.0 if model.dead_time > 0.0 else at_infinity(law.characteristic(model)[-1])
 
 
 def ensemble_ms(law: ControlLaw, models: ModelSet) -> float:
