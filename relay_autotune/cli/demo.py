@@ -48,10 +48,6 @@ _DEADLINE = 120.0
 _LOOK_EVERY = 0.1
 
 
-class DemoError(RelayAutotuneError):
-    """The demo could not continue."""
-
-
 def main() -> int:
     """Run the demo; leave bag, result, picture and report in ``demo_output/``."""
     return run_command("demo", partial(_demonstrate, Path("demo_output")))
@@ -72,7 +68,7 @@ def _demonstrate(output: Path) -> int:
     except OSError as error:
         if error.filename is None:
             raise
-        raise DemoError(
+        raise RelayAutotuneError(
             f"{error.filename} cannot be written: {system_says(error)}; run the demo where you "
             "may write"
         ) from error
@@ -132,7 +128,7 @@ def _watch(nodes: OwnNodes, output: Path) -> tuple[Path, Any]:
 
         def wait(condition: Callable[[], object]) -> None:
             if not client.wait(lambda: bool(condition()), deadline - time.monotonic()):
-                raise DemoError(
+                raise RelayAutotuneError(
                     f"the tune took longer than {_DEADLINE:g} s; the logs are in {output}"
                 )
 
@@ -191,7 +187,7 @@ def _finish(output: Path, live: Any) -> int:
     recording = read_experiments(output / "bag")
     found = analyse(recording.experiments[0])
     if found.model is None or found.best_gains is None:
-        raise DemoError(f"nothing was identified: {found.reason}")
+        raise RelayAutotuneError(f"nothing was identified: {found.reason}")
     case = case_of(found, str(output / "bag"), truth=TRUTH)
     _compare(case)
     gains = found.best_gains
