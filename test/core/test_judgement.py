@@ -26,6 +26,7 @@ from relay_autotune.identification.judgement.table import CHECKS
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import Part
+from relay_autotune.identification.waveform import posterior
 from relay_autotune.loop import analysis
 from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.response import response
@@ -214,6 +215,24 @@ def fitted_as(model, record):
     found = in_parts(record)
     values = np.array((model.gain, model.time_constants[0].real, model.dead_time))
     return replace(found, estimate=replace(found.estimate, values=values))
+
+
+@pytest.mark.parametrize("at", [20.0, 20.2])
+def test_a_part_that_begins_at_rest_has_no_free_state(monkeypatch, at):
+    """With one, a step at its begin would be explained with a gain of any sign."""
+    parts, drawn = [], posterior._allowed
+
+    def noted(problem, *args):
+        parts.append(problem)
+        return drawn(problem, *args)
+
+    monkeypatch.setattr(posterior, "_allowed", noted)
+    time = np.arange(0.0, 300.0, 0.5)
+    u = PiecewiseConstant(np.array([at]), np.array([1.0]), 0.0)
+    y = response(PROCESS, time, u) + np.random.default_rng(2).normal(0.0, 0.02, time.size)
+    in_parts(Record(time, y, u(time), held_input=u))
+    begins = [0.0, 20.0 if at == 20.0 else 20.5]
+    assert [(p.time[0], p.relaxation) for p in parts[:2]] == [(b, False) for b in begins]
 
 
 def test_each_half_of_a_record_tells_its_own_process():

@@ -38,6 +38,7 @@ from relay_autotune.identification.waveform.separable import (
 )
 from relay_autotune.process.structures import Structure
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.excitation import changes_within
 from relay_autotune.record.record import PiecewiseConstant
 
 # Samples at which draws are compared with the fit, and those of both parts together.
@@ -185,9 +186,9 @@ def _parts(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part, 
 
     They meet where the command first has its full reach: an actuator at its end, or a process that
     is not linear, answers large moves otherwise than small ones. Where one of them would tell
-    little, they hold equal information on the parameters. Each has its own offset and free initial
-    state, the first one only where the whole record has one. One that its own models do not
-    explain, such as a rest after all responses, tells nothing.
+    little, they hold equal information on the parameters. Each has its own offset, and a free
+    initial state where the whole record has one or the command moved before. One that its own
+    models do not explain, such as a rest after all responses, tells nothing.
     """
     problem, state = fit.problem, fit.state
     if len(problem.bounds) > 1 or problem.structure.unstable:
@@ -204,11 +205,12 @@ def _parts(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part, 
         middle = int(np.searchsorted(information, 0.5 * information[-1]))
     if min(middle, problem.time.size - middle) < max(_FEWEST, 4 * state.parameters):
         return ()
-    second = problem.part(slice(middle, None))
-    # The free state of an integrator is the offset.
-    second = replace(second, relaxation=bool(problem.structure.factors))
+    first, second = problem.part(slice(None, middle)), problem.part(slice(middle, None))
+    if changes_within(problem.inputs[0], first.time).size:
+        # The free state of an integrator is the offset.
+        second = replace(second, relaxation=bool(problem.structure.factors))
     parts = []
-    for part in (problem.part(slice(None, middle)), second):
+    for part in (first, second):
         degrees = max(part.time.size - evaluate(part, state.theta).parameters, 1)
 
         def variance_of(left: FloatArray, degrees: int = degrees) -> float:
