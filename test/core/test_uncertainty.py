@@ -156,7 +156,8 @@ def test_a_robust_loss_withstands_outliers_that_squares_do_not(loss):
     truth = np.array((1.65, 20.0, 10.0))
     clean = _record(tuple(truth), 0.05)
     rng = np.random.default_rng(5)
-    many = rng.random(len(clean)) < 0.08
+    # More than are taken for spikes of the sensor and left out.
+    many = rng.random(len(clean)) < 0.15
     spoiled = clean.measurement + np.where(many, rng.standard_normal(len(clean)) + 1.0, 0.0)
     record = replace(clean, measurement=spoiled)
     squares = identify(record, "waveform", GIVEN)

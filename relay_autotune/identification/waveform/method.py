@@ -67,8 +67,9 @@ _ENOUGH_FOR_TWO, _EXCHANGED = 20, 4.0
 _LEAST_SAMPLES = 12
 # Largest number of samples that are fitted: beyond, noise does not limit what is known.
 _MOST_SAMPLES = 2_000_000
-_OUTLIER = 6.0
-_MOST_OUTLIERS = 0.02
+# Standard deviations of a spike, the most samples of one, and the largest share of all: of data
+# as they come 1 to 10 % are gross errors (Hampel, Ronchetti, Rousseeuw and Stahel 1986).
+_OUTLIER, _SPIKE, _MOST_OUTLIERS = 6.0, 3, 0.1
 # Largest share of the samples after a jump near the end that are left out, and the ratio by which
 # that divides the mean square of the residual.
 _MOST_LATE, _DIVIDED = 0.05, 0.5
@@ -385,14 +386,20 @@ def _outliers(whole: Problem, problem: Problem, state: Trial) -> NDArray[np.bool
     :param problem: what was fitted of them.
     :param state: the fit.
     """
-    found = np.zeros(whole.time.size, dtype=bool)
-    error = np.abs(state.residual - np.median(state.residual))
-    width = scale_of(state.residual)
+    found, white = np.zeros(whole.time.size, dtype=bool), replace(problem, colour=None)
+    left, n = raw_residual(problem, state), np.arange(problem.y.size)
+    error = white.seen(left)
+    middle, width = float(np.median(error)), scale_of(error)
     # A coarse sensor is now and then a step off, however narrow the bulk of its errors is.
-    far = error > max(_OUTLIER * width + quantisation_step(whole.y), NEGLIGIBLE)
-    # Many of them, or several in a row, are not spikes but something that the model lacks.
-    alone = far & ~np.roll(far, 1) & ~np.roll(far, -1)
-    if width > NEGLIGIBLE and np.sum(far) == np.sum(alone) <= _MOST_OUTLIERS * found.size:
+    most = max(_OUTLIER * width + quantisation_step(whole.y), NEGLIGIBLE)
+    far = np.abs(error - middle) > most
+    if not (width > NEGLIGIBLE and 0.0 < far.mean() <= _MOST_OUTLIERS):
+        return found
+    # Where more are in a row, or a line between their neighbours misses the model as well, there
+    # is something that the model lacks.
+    ends = np.flatnonzero(np.diff(far, prepend=False, append=False))
+    across = white.seen(np.interp(n, n[~far], problem.y[~far]) - problem.y + left) - middle
+    if np.max(ends[1::2] - ends[::2]) <= _SPIKE and np.abs(across[far]).max() <= most:
         found[_places(whole, problem)] = far
     return found
 
