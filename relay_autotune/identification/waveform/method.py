@@ -52,7 +52,14 @@ from relay_autotune.identification.waveform.problem import (
 )
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import scale_of, slow_colour, weights
-from relay_autotune.identification.waveform.separable import TRIAL, Trial, evaluate, refine
+from relay_autotune.identification.waveform.separable import (
+    TRIAL,
+    Trial,
+    evaluate,
+    information_criterion,
+    left_in_simulation,
+    refine,
+)
 from relay_autotune.identification.waveform.starts import is_controlled
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, TABLE
@@ -234,13 +241,40 @@ def _before_stop(problem: Problem, chosen: Choose) -> tuple[Problem, str]:
         if model is None or model.grows:
             continue
         on = response(model, problem.time[begin:stop], u)
-        if float(np.median(on[1:] - on[0])) / away > 1.0:
+        if float(np.median(on[1:] - on[0])) / away > 1.0 and _is_stop(
+            problem.part(slice(0, stop)), begin, fit, chosen
+        ):
             return before, (
                 f"from {problem.time[begin]:.4g} s on the measurement stays at an end of its "
                 "range, where the process would move on: a stop, or the sensor's end; it and all "
                 "after it were left out"
             )
     return problem, ""
+
+
+def _is_stop(problem: Problem, begin: int, before: Fit, chosen: Choose) -> bool:
+    """Return whether no process explains a stay as well as a constant does.
+
+    :param problem: the samples up to the end of the stay.
+    :param begin: its first sample.
+    :param before: a fit of those before it.
+    :param chosen: fits samples.
+    """
+    try:
+        fits = before, chosen(problem.thinned(_FEW), SIMPLE)
+    except IdentificationError:
+        return True
+    if fits[1].problem.load is not None:
+        # A load that comes just there is no process that goes on.
+        return True
+    moves, goes_on = (
+        left_in_simulation(f.problem, f.state.coefficients, f.state.theta)[0] ** 2 for f in fits
+    )
+    n, stays = problem.y.size, float(np.var(problem.y[begin:]))
+    floor, stopped = n * NEGLIGIBLE**2, begin * moves + (n - begin) * stays
+    gained = information_criterion(n * goes_on, n, 0, floor)
+    # The constant and its instant are estimated.
+    return gained - information_criterion(stopped, n, 2, floor) > ANSWERED
 
 
 def _measured(records: Sequence[Record]) -> list[FloatArray]:
