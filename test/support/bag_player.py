@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from mcap.reader import make_reader
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Float64
 
-from relay_autotune.bag.bag_file import McapFile
 from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
 
 KINDS: dict[str, Any] = {
@@ -34,30 +34,26 @@ def main() -> None:
     (path,), rate = Path(sys.argv[1]).glob("*.mcap"), float(sys.argv[2])
     rclpy.init()
     node = rclpy.create_node("bag_player")
-    waiting: list[tuple[int, int, Any]] = []
-    publishers: dict[int, Any] = {}
-    with McapFile(path) as file:
-        for channel in file.channels.values():
-            if channel.type in KINDS:
-                latched = "transient_local" in channel.metadata["offered_qos_profiles"]
+    waiting: list[tuple[int, str, Any]] = []
+    publishers: dict[str, Any] = {}
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            kind = None if schema is None else KINDS.get(schema.name)
+            if kind is None:
+                continue
+            if channel.topic not in publishers:
                 qos = QoSProfile(depth=1000)
-                if latched:
+                if "transient_local" in channel.metadata["offered_qos_profiles"]:
                     qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
-                kind = KINDS[channel.type]
-                publishers[channel.id] = node.create_publisher(kind, channel.topic, qos)
-        for channel, _, found in file.read(publishers.keys()):
-            kind = KINDS[file.channels[channel].type]
-            places = zip(found.begin.tolist(), found.end.tolist(), strict=True)
-            for stamp, (begin, end) in zip(found.log_time.tolist(), places, strict=True):
-                data = bytes(found.content[begin:end])
-                waiting.append((stamp, channel, deserialize_message(data, kind)))
-    waiting.sort(key=lambda item: item[0])
+                publishers[channel.topic] = node.create_publisher(kind, channel.topic, qos)
+            data = deserialize_message(message.data, kind)
+            waiting.append((message.log_time, channel.topic, data))
     while any(publisher.get_subscription_count() == 0 for publisher in publishers.values()):
         rclpy.spin_once(node, timeout_sec=0.05)
     begin, first = time.monotonic(), waiting[0][0]
-    for stamp, channel, message in waiting:
+    for stamp, topic, message in waiting:
         time.sleep(max(0.0, begin + (stamp - first) / 1e9 / rate - time.monotonic()))
-        publishers[channel].publish(message)
+        publishers[topic].publish(message)
     while True:
         # Stay alive, so that latched messages remain available to the test.
         rclpy.spin_once(node, timeout_sec=1.0)
