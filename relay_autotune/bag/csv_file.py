@@ -494,7 +494,7 @@ def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[tuple[st
     ]
     found = [(y, u, all(hints)) for y in pair[0] for u in pair[1] if y != u]
     # Of a plant's columns, those of one loop belong together.
-    of_one = [each for each in found if tag_of(each[0]) == tag_of(each[1]) != ""]
+    of_one = [(y, u, named) for y, u, named in found if tag_of(y) == tag_of(u) != ""]
     return (of_one or found)[:_MOST_CHOICES]
 
 

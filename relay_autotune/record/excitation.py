@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from relay_autotune.arrays import FloatArray, IntArray
 from relay_autotune.record.cycles import GAP_INTERVALS, follow_measurement, two_level_runs
@@ -218,6 +219,15 @@ def _unbroken(record: Record) -> list[tuple[int, int]]:
     return list(zip(begins.tolist(), ends.tolist(), strict=True))
 
 
+def runs_of(there: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return where each run of samples begins, and the sample after its last one.
+
+    :param there: True within the runs, shape (n,).
+    """
+    edges = np.flatnonzero(np.diff(there, prepend=False, append=False))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
 def at_its_ends(y: FloatArray, band: float = 0.0) -> list[tuple[int, int, float]]:
     """Return where a measurement stopped in mid-movement at an end of its range, and stayed.
 
@@ -234,9 +244,7 @@ def at_its_ends(y: FloatArray, band: float = 0.0) -> list[tuple[int, int, float]
         return []
     runs = []
     for end in (low, high):
-        there = (np.abs(y - end) <= band).astype(np.int8)
-        edges = np.flatnonzero(np.diff(np.concatenate(([0], there, [0]))))
-        pairs = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+        pairs = runs_of(np.abs(y - end) <= band)
         runs += [(begin, stop, end) for begin, stop in pairs if stop - begin >= _SATURATED]
     if not runs:
         return []
@@ -254,7 +262,7 @@ def at_its_ends(y: FloatArray, band: float = 0.0) -> list[tuple[int, int, float]
     ]
 
 
-def _saturated(y: FloatArray) -> np.ndarray:
+def _saturated(y: FloatArray) -> NDArray[np.bool_]:
     """Return which samples are constant at an end of the measurement's range, but not at rest."""
     still = np.zeros(y.size, dtype=np.bool_)
     if float(np.mean(np.diff(y) == 0.0)) > 0.5:

@@ -462,7 +462,7 @@ def _likeliest_colour(context: FitContext, simulated: list[Candidate]) -> list[C
     if own is None:
         return simulated
     found = _converged(_in(own, simulated, context), context)
-    least = min(map(_left, simulated))
+    least = min(map(mean_square_left, simulated))
     return found if found and _simulates(found[0], least) else simulated
 
 
@@ -515,13 +515,16 @@ def _simulates(candidate: Candidate, least: float) -> bool:
     :param candidate: fitted in a colour.
     :param least: mean square that the best simulation leaves.
     """
-    return _left(candidate) <= _WORSE * least
+    return mean_square_left(candidate) <= _WORSE * least
 
 
-def _left(candidate: Candidate) -> float:
-    """Return the mean square that a candidate leaves in simulation."""
-    state = candidate.state
-    return left_in_simulation(candidate.problem, state.coefficients, state.theta)[0] ** 2
+def mean_square_left(found: Candidate | Fit) -> float:
+    """Return the mean square that a candidate or a fit leaves in simulation.
+
+    :param found: with what was fitted.
+    """
+    state = found.state
+    return left_in_simulation(found.problem, state.coefficients, state.theta)[0] ** 2
 
 
 def _finished(

@@ -34,6 +34,7 @@ from relay_autotune.identification.waveform.choice import (
     TRIED,
     ahead_of_command,
     chosen_fit,
+    mean_square_left,
     names_near,
     no_response,
     odds_of_response,
@@ -57,13 +58,12 @@ from relay_autotune.identification.waveform.separable import (
     Trial,
     evaluate,
     information_criterion,
-    left_in_simulation,
     refine,
 )
 from relay_autotune.identification.waveform.starts import is_controlled
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, TABLE
-from relay_autotune.record.excitation import at_its_ends, changes_within, smooth
+from relay_autotune.record.excitation import at_its_ends, changes_within, runs_of, smooth
 from relay_autotune.record.record import Input, PiecewiseConstant, Record, roughness
 from relay_autotune.text import counted, digits
 
@@ -267,9 +267,7 @@ def _is_stop(problem: Problem, begin: int, before: Fit, chosen: Choose) -> bool:
     if fits[1].problem.load is not None:
         # A load that comes just there is no process that goes on.
         return True
-    moves, goes_on = (
-        left_in_simulation(f.problem, f.state.coefficients, f.state.theta)[0] ** 2 for f in fits
-    )
+    moves, goes_on = map(mean_square_left, fits)
     n, stays = problem.y.size, float(np.var(problem.y[begin:]))
     floor, stopped = n * NEGLIGIBLE**2, begin * moves + (n - begin) * stays
     gained = information_criterion(n * goes_on, n, 0, floor)
@@ -414,7 +412,7 @@ def _before_jump(whole: Problem, fit: Fit) -> int:
 
 
 def _outliers(whole: Problem, problem: Problem, state: Trial) -> NDArray[np.bool_]:
-    """Return which samples no noise of the residual's own width explains, shape (n,).
+    """Return which samples are spikes, which neither model nor noise explains, shape (n,).
 
     :param whole: all samples.
     :param problem: what was fitted of them.
@@ -431,9 +429,9 @@ def _outliers(whole: Problem, problem: Problem, state: Trial) -> NDArray[np.bool
         return found
     # Where more are in a row, or a line between their neighbours misses the model as well, there
     # is something that the model lacks.
-    ends = np.flatnonzero(np.diff(far, prepend=False, append=False))
     across = white.seen(np.interp(n, n[~far], problem.y[~far]) - problem.y + left) - middle
-    if np.max(ends[1::2] - ends[::2]) <= _SPIKE and np.abs(across[far]).max() <= most:
+    longest = max(stop - begin for begin, stop in runs_of(far))
+    if longest <= _SPIKE and np.abs(across[far]).max() <= most:
         found[_places(whole, problem)] = far
     return found
 
