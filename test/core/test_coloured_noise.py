@@ -254,6 +254,7 @@ def test_the_simulation_shows_the_direction(monkeypatch):
     assert [c.model.process_sign for c in fit.candidates] == [1, -1]
 
 
+@pytest.mark.nightly
 def test_a_run_up_that_is_not_linear_does_not_hide_a_step():
     """A command before the record, acting 9 s late, had explained the step, and nothing else."""
     time = 0.02 * np.arange(1000.0)
@@ -408,6 +409,7 @@ def test_a_growing_mode_is_tried_where_a_relay_held_the_process(sign):
     assert ("unstable_fopdt" in tried) is bool(sign)
 
 
+@pytest.mark.nightly
 def test_an_integrator_that_is_driven_one_way_is_no_lag_of_many_records():
     rng, time = np.random.default_rng(0), 0.01 * np.arange(1500)
     u = 60.0 + 20.0 * np.sin(time) + 0.15 * np.cumsum(rng.normal(0.0, 1.0, time.size))
@@ -451,13 +453,14 @@ def _thermostat(rng):
     return Record(time=time, measurement=np.array(measured), command=np.array(command))
 
 
-def test_a_measurement_of_another_process_is_no_response():
+@pytest.mark.parametrize("seeds", [2, pytest.param(8, marks=pytest.mark.nightly)])
+def test_a_measurement_of_another_process_is_no_response(seeds):
     time, pole = np.arange(0.0, 400.0), math.exp(-1.0 / 25.0)
     command = np.where((time >= 60.0) & (time < 160.0) | (time >= 240.0), 1.0, 0.0)
     process = TransferFunction.fopdt(2.0, 20.0, 6.0)
     answer = response(process, time, PiecewiseConstant.from_samples(time, command))
     refused, fopdt = 0, Known(structure="fopdt")
-    for seed in range(8):
+    for seed in range(seeds):
         rng = np.random.default_rng(seed)
         slow = lfilter([1.0], [1.0, -2.0 * pole, pole**2], rng.standard_normal(800))[400:]
         slow, noise = slow / slow.std(), 0.01 * rng.standard_normal(time.size)
@@ -468,7 +471,7 @@ def test_a_measurement_of_another_process_is_no_response():
         except IdentificationError as error:
             refused += "no response" in str(error)
     # One in eight may move with the command by chance.
-    assert refused >= 7
+    assert refused > 0.8 * seeds
 
 
 def pulses_over_a_drift(gain: float, *, walks: bool) -> Record:
@@ -495,7 +498,8 @@ def pulses_over_a_drift(gain: float, *, walks: bool) -> Record:
     return Record(time=time, measurement=50.0 + gain * heat + drift + noise, command=command)
 
 
-@pytest.mark.parametrize("walks", [True, False])
+@pytest.mark.by_day(1)
+@pytest.mark.parametrize("walks", [False, True])
 def test_pulses_over_a_drift_of_several_times_their_answer_show_the_process(walks):
     """They were refused: too little was explained, or a slow model, and no response."""
     found = analyse(pulses_over_a_drift(1.5, walks=walks), alone=True)
@@ -504,6 +508,7 @@ def test_pulses_over_a_drift_of_several_times_their_answer_show_the_process(walk
     assert found.model.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.1)
 
 
+@pytest.mark.nightly
 def test_a_drift_alone_shows_none():
     found = analyse(pulses_over_a_drift(0.0, walks=True), alone=True)
     assert "no response" in found.reason
