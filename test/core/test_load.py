@@ -90,6 +90,7 @@ def test_what_is_not_known_of_the_load_widens_the_intervals():
     assert np.all(np.diag(loaded.covariance) > np.diag(as_if_known.covariance))
 
 
+@pytest.mark.by_day(1)
 @pytest.mark.parametrize(("noise_std", "seed"), [(0.0114, 1003), (0.0001, 3)])
 def test_all_draws_are_had_beside_a_load_and_a_zero_that_a_dead_time_cancels(noise_std, seed):
     acting = {"load_time": 25.6, "load_size": 0.2, "noise_std": noise_std, "seed": seed}
@@ -135,7 +136,8 @@ def controlled(
     return Record(interval * np.arange(samples), y, u)
 
 
-@pytest.mark.parametrize("load", [-5.0, 0.0])
+@pytest.mark.by_day(1)
+@pytest.mark.parametrize("load", [0.0, -5.0])
 def test_a_load_under_a_controller_does_not_change_the_model(load):
     """It was taken for a slow disturbance, and the gain for two thirds of what it is."""
     found = identify(controlled(load), "waveform")

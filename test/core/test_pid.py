@@ -187,7 +187,7 @@ def test_the_settling_time_is_predicted_within_the_band_in_which_it_is_measured(
     assert clean.expected.settling_time > 1.2 * last
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_the_uncertainty_of_the_gain_is_three_standard_deviations_of_it():
     step, noise_std, rng = Step(setpoint=0.5), 0.02, np.random.default_rng(8)
     time, exact = measured(PROCESS, step)
@@ -322,6 +322,7 @@ def test_the_command_that_is_expected_holds_what_the_noise_does(rate):
 
 
 @pytest.mark.long
+@pytest.mark.by_day(1)
 # The largest deviation by a load takes up noise, which makes its comparison looser.
 @pytest.mark.parametrize(("step", "less"), [(Step(setpoint=1.0), 0.2), (Step(load=1.0), 0.06)])
 def test_the_least_step_is_where_the_noise_begins_to_decide(step, less):

@@ -50,6 +50,7 @@ def test_methods_for_an_ideal_relay_step_aside(method):
 
 
 @pytest.mark.long
+@pytest.mark.by_day(1)
 @pytest.mark.parametrize(
     "model",
     [TransferFunction.fopdt(1.65, 20.0, 10.0), INTEGRATOR_LAG.build((0.5, 2.0, 1.0))],
