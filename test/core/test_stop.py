@@ -62,16 +62,19 @@ def test_a_process_that_comes_to_rest_stands_at_no_stop(model, changes, levels):
     assert not told_of_a_stop(identify(recorded(model, changes, levels), known=known))
 
 
-def test_a_process_as_fast_as_its_samples_stands_at_no_stop():
+@pytest.mark.by_day(1)
+@pytest.mark.parametrize(
+    ("tau", "dead_time"), [(1.63, 4.76), (0.44, 1.34), (1.12, 4.94), (1.32, 3.64)]
+)
+def test_a_process_as_fast_as_its_samples_stands_at_no_stop(tau, dead_time):
     """Of its movement there are too few samples to tell how far it would go."""
     time = np.arange(0.0, 300.0)
     u = PiecewiseConstant(np.array([20.0, 120.0, 220.0]), np.array([1.0, 0.0, 1.0]), 0.0)
-    for tau, dead_time in ((1.63, 4.76), (0.44, 1.34), (1.12, 4.94), (1.32, 3.64)):
-        y = response(TransferFunction.fopdt(1.0, tau, dead_time), time, u)
-        y += 0.003 * np.random.default_rng(1).standard_normal(time.size)
-        found = identify(Record(time, y, u(time)), known=Known(structure="fopdt"))
-        assert not told_of_a_stop(found)
-        assert found.model.gain == pytest.approx(1.0, rel=0.01)
+    y = response(TransferFunction.fopdt(1.0, tau, dead_time), time, u)
+    y += 0.003 * np.random.default_rng(1).standard_normal(time.size)
+    found = identify(Record(time, y, u(time)), known=Known(structure="fopdt"))
+    assert not told_of_a_stop(found)
+    assert found.model.gain == pytest.approx(1.0, rel=0.01)
 
 
 def test_a_process_that_came_to_rest_in_a_gap_of_the_rows_stands_at_no_stop():

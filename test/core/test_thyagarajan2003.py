@@ -156,7 +156,7 @@ def test_an_unstable_fopdt_process_with_hysteresis(relay, dead_time):
 
 @pytest.mark.long
 @pytest.mark.parametrize("relay", RELAYS)
-@pytest.mark.parametrize("ratio", [0.001, 0.01, 0.1])
+@pytest.mark.parametrize("ratio", [pytest.param(0.001, marks=pytest.mark.nightly), 0.01, 0.1])
 def test_two_equal_lags_with_hysteresis(relay, ratio):
     s = reading(TransferFunction.lag_n(1.5, 3.0, 2, 3.0 * ratio), relay)
     found = equal_lags(2, s.period, s.amplitude, 2.0, relay.hysteresis, ratio=ratio)
@@ -164,7 +164,7 @@ def test_two_equal_lags_with_hysteresis(relay, ratio):
 
 
 @pytest.mark.parametrize("relay", RELAYS[1:])
-@pytest.mark.parametrize("order", [3, 5, 10, 20])
+@pytest.mark.parametrize("order", [3, 5, 10, pytest.param(20, marks=pytest.mark.nightly)])
 def test_higher_orders_with_hysteresis(relay, order):
     s = reading(TransferFunction.lag_n(1.5, 3.0, order, 0.0), relay)
     found = equal_lags(order, s.period, s.amplitude, 2.0, relay.hysteresis)
