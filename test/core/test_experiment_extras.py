@@ -170,6 +170,7 @@ def test_of_both_levels_clipped_alike_only_gains_that_hold_are_trusted(known, sh
         assert hold or found.verdict is not Verdict.TRUSTED
 
 
+@pytest.mark.long
 @pytest.mark.by_day(1)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_levels_that_the_actuator_does_not_reach_show_beside_the_smaller_ones(seed):

@@ -22,6 +22,8 @@ from relay_autotune.process.structures import FOPDT, structure_named
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record
 
+pytestmark = pytest.mark.long
+
 FIRST_ORDER = structure_named("fopdt").of_fields(gain=1.65, time_constants=[20.0], dead_time=10.0)
 SECOND_ORDER = structure_named("sopdt").of_fields(
     gain=1.0, time_constants=[20.0, 8.0], dead_time=4.0
@@ -34,7 +36,6 @@ def run(model, *, load_time, load_size, noise_std, seed):
     return tuned(model, ExperimentParameters(amplitude=1.0), period=PERIOD, seed=seed, **acting)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "load_time", "load_size", "noise_std"),
     [
@@ -77,7 +78,6 @@ def test_no_load_is_found_where_noise_explains_what_is_left(noise_std):
     assert not any("load step" in text for text in found.warnings)
 
 
-@pytest.mark.long
 def test_what_is_not_known_of_the_load_widens_the_intervals():
     tune = run(SECOND_ORDER, load_time=25.6, load_size=0.2, noise_std=0.0114, seed=1003)
     known, record = Known(structure="sopdt"), tune.record()

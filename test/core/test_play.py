@@ -18,6 +18,8 @@ from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Actuator, Disturbances, VirtualProcess
 from relay_autotune.quantities import NORMAL_95
 
+pytestmark = pytest.mark.long
+
 PROCESS = TransferFunction.fopdt(1.0, 1.0, 0.3)
 PERIOD, HOLD, NOISE = 0.05, 16, 0.02
 UP_AND_DOWN = [

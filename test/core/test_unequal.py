@@ -18,7 +18,10 @@ from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import PiecewiseConstant, Record
 
+pytestmark = pytest.mark.long
 
+
+@pytest.mark.by_day(1)
 @pytest.mark.parametrize(
     ("gains", "moves"),
     [
@@ -61,7 +64,8 @@ def test_a_staircase_over_a_gain_that_grows_is_no_integrator():
     assert sum(t.real for t in found.model.time_constants) < 40.0
 
 
-@pytest.mark.parametrize("ends", [(-3.0, 8.0), (-5.0, 12.0), (-100.0, 8.0), (-100.0, 100.0)])
+@pytest.mark.by_day(2)
+@pytest.mark.parametrize("ends", [(-3.0, 8.0), (-100.0, 100.0), (-5.0, 12.0), (-100.0, 8.0)])
 def test_an_actuator_that_ends_is_found_in_what_its_controller_sent(ends):
     """Without the ends the model was trusted with half of the gain, and a true Ms of 3.5."""
     process = SOPDT.of_fields(gain=1.5, time_constants=[20.0, 5.0], dead_time=6.0)
@@ -85,6 +89,7 @@ def test_an_actuator_that_ends_is_found_in_what_its_controller_sent(ends):
     assert np.isfinite(found.ends).any() == (ends != (-100.0, 100.0))
 
 
+@pytest.mark.nightly
 def test_ends_are_found_where_the_controller_is_beyond_them_most_of_the_time():
     """They were not, and the gains were trusted with three times the ultimate gain."""
     process = SOPDT.of_fields(gain=2.5, time_constants=[34.0, 12.0], dead_time=7.3)
