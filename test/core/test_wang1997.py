@@ -200,7 +200,7 @@ def _rested(noise: float, seed: int) -> Record:
     )
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_the_error_of_the_steady_state_is_one_of_the_gain():
     # The true rest is known here, so that what is left is that of its 40 noisy samples.
     scores, shares = [], []
