@@ -51,9 +51,8 @@ def test_a_first_swing_much_longer_than_the_cycles_does_not_turn_the_gain():
     assert found.ultimate_gain == pytest.approx(_point(model).gain, rel=0.04)
 
 
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (1, 2))]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", range(3))
 def test_a_pair_faster_than_its_lag_is_no_drift(seed):
     model = LAG_COMPLEX.build((1.0, 1.0, 10.0, 0.7, 0.0))
     found = identify_waveform(_record(model, 0.005, seed))
@@ -94,7 +93,7 @@ def test_an_inverse_response_is_found_that_a_fopdt_does_not_show(model, noise_st
     assert found.ultimate_gain == pytest.approx(_point(model).gain, rel=within)
 
 
-@pytest.mark.by_day(1)
+@pytest.mark.nightly
 @pytest.mark.parametrize("seed", [3, 15])
 def test_a_first_swing_that_a_fopdt_lacks_is_not_left_out(seed):
     model = TransferFunction(1.0, (), (1.0, 0.2, 0.04, 0.008), 0, 0.0)

@@ -343,6 +343,7 @@ def test_heating_up_from_cold_is_no_switch_of_the_relay():
     assert record.time[relay.up[0]] > 300.0
 
 
+@pytest.mark.nightly
 def test_a_walk_that_an_outlier_ends_is_no_response():
     """In colour, a dead time as long as the record had explained the outlier."""
     rng = np.random.default_rng(9)
@@ -498,8 +499,8 @@ def pulses_over_a_drift(gain: float, *, walks: bool) -> Record:
     return Record(time=time, measurement=50.0 + gain * heat + drift + noise, command=command)
 
 
-@pytest.mark.by_day(1)
-@pytest.mark.parametrize("walks", [False, True])
+@pytest.mark.nightly
+@pytest.mark.parametrize("walks", [True, False])
 def test_pulses_over_a_drift_of_several_times_their_answer_show_the_process(walks):
     """They were refused: too little was explained, or a slow model, and no response."""
     found = analyse(pulses_over_a_drift(1.5, walks=walks), alone=True)

@@ -65,14 +65,13 @@ def test_the_right_direction_of_an_inverse_response_yields_gains(model, period):
     assert np.sign(found.best_gains.kc) == model.process_sign
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "acting",
     [
-        pytest.param({"drift": 0.003, "noise_std": 0.01}, marks=pytest.mark.nightly),
-        pytest.param(
-            {"load_time": 9.0, "load_size": 0.3, "noise_std": 0.01}, marks=pytest.mark.nightly
-        ),
-        pytest.param({"quantisation": 0.1}, marks=pytest.mark.nightly),
+        {"drift": 0.003, "noise_std": 0.01},
+        {"load_time": 9.0, "load_size": 0.3, "noise_std": 0.01},
+        {"quantisation": 0.1},
         {"noise_std": 0.1},
     ],
 )

@@ -135,7 +135,7 @@ def test_a_loop_at_rest_is_no_experiment():
     assert spans(controlled(lambda t: 0.0)) == []
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_a_loop_at_rest_gives_no_gains_even_where_it_is_asked_to():
     """Its command follows the noise: read as its cause, that is a model of the controller."""
     found = analyse(controlled(lambda t: 0.0, samples=800))

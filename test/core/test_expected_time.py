@@ -29,7 +29,7 @@ def test_two_records_take_the_time_of_both_and_other_methods_take_more():
     assert expected_time(500, alone=True, clock=frozen()) < one
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_an_analysis_takes_about_as_long_as_is_said():
     record = relay_record()
     begun = time.process_time()

@@ -370,6 +370,7 @@ def test_gains_from_a_clipped_actuator_are_not_trusted():
     assert analyse(clipped_steps(1.5), alone=True).verdict is not Verdict.TRUSTED
 
 
+@pytest.mark.nightly
 def test_a_relay_whose_levels_are_clipped_on_one_side_gives_no_trusted_gains():
     process = TransferFunction.fopdt(1.0, 8.0, 3.0)
     plant = VirtualProcess(

@@ -49,6 +49,7 @@ def test_a_faster_controller_gets_gains_that_hold_whenever_the_command_changed(i
     assert any("before its row" in warning for warning in found.model.warnings)
 
 
+@pytest.mark.nightly
 def test_the_controller_that_wrote_the_table_is_told_nothing_of_it():
     found = analyse(_logged(30.0, (600.0, 2220.0, 3900.0)), rule="robust", alone=True)
     assert not any("before its row" in warning for warning in found.model.warnings)

@@ -91,7 +91,7 @@ def test_play_is_no_term_where_the_command_cannot_show_it(levels, shown):
     assert all((problem.most_play(held=held) > 0.0) is shown for held in (False, True))
 
 
-@pytest.mark.by_day(2)
+@pytest.mark.by_day(1)
 @pytest.mark.parametrize(("band", "noise"), [(0.04, 0.01), (0.0, 0.005), (0.04, 0.005)])
 def test_a_relay_whose_first_cycle_is_smaller_shows_its_play(band, noise):
     """K_u was 2 % off for a play of 2 % of the swing, and nothing was said of it."""

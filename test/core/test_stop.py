@@ -31,8 +31,7 @@ def told_of_a_stop(found):
     return any("stays at an end of its range" in warning for warning in found.warnings)
 
 
-@pytest.mark.long
-@pytest.mark.by_day(1)
+@pytest.mark.nightly
 @pytest.mark.parametrize("noise", [0.002, 0.02, 0.01])
 def test_a_stop_is_no_rest(noise):
     # Gains of a process that would come to rest at the stop made this one grow.

@@ -44,6 +44,7 @@ def test_what_a_controller_keeps_from_running_away_is_no_integrator(gains, moves
     assert found.model.gain == pytest.approx(process.gain, rel=0.02)
 
 
+@pytest.mark.nightly
 def test_a_staircase_over_a_gain_that_grows_is_no_integrator():
     """Each step answers more than the one before, as an integrator's would."""
     rng = np.random.default_rng(5)
