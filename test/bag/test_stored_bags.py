@@ -70,7 +70,7 @@ def test_the_samples_are_those_that_were_recorded(name):
 @pytest.mark.parametrize("name", FOUND)
 def test_the_process_is_found_again(name):
     said, true, tolerance = FOUND[name]
-    model = analysed_once(the_record(name)).model
+    model = analysed_once(the_record(name), alone=True).model
     np.testing.assert_allclose(model.values, said, rtol=1e-6)
     np.testing.assert_allclose(model.values, true, rtol=tolerance)
 
@@ -78,7 +78,7 @@ def test_the_process_is_found_again(name):
 @pytest.mark.parametrize("name", ["biased_relay", "unbiased_relay_with_noise"])
 def test_replay_says_what_the_live_identifier_said(name):
     gains = live_result(name, "relay_autotune_msgs/msg/PidGains")
-    found = analysed_once(the_record(name))
+    found = analysed_once(the_record(name), alone=True)
     model = live_result(name, "relay_autotune_msgs/msg/TransferFunction")
     assert list(model.parameters) == list(found.model.parameters)
     np.testing.assert_allclose(

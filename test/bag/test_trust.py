@@ -408,6 +408,7 @@ def test_message_indexes_of_other_topics_are_not_read(tmp_path):
 # --- valid framing that lies inside it
 
 
+@pytest.mark.by_day(2)
 @pytest.mark.parametrize("part", range(4))
 def test_bags_that_lie(tmp_path, part):
     seeds = fuzz_framing.seeds_once()
