@@ -9,12 +9,15 @@ import functools
 import pickle
 from dataclasses import replace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.analysis import analyse
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.methods import identify
+from relay_autotune.identification.result import Identification
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Outcome, Record, RelaySettings
 from relay_autotune.result import Analysis
@@ -44,11 +47,21 @@ def relay_record(
     )
 
 
+_MODELS: dict[bytes, Identification] = {}
 _FOUND: dict[bytes, Analysis] = {}
+
+
+def _identified_once(*asked: Any) -> Identification:
+    key = pickle.dumps(asked)
+    if key not in _MODELS:
+        _MODELS[key] = identify(*asked)
+    return _MODELS[key]
 
 
 def analysed_once(record: Record, *, tell: object = None, **task: Any) -> Analysis:
     """Analyse a record, once for all tests: equal records give equal numbers.
+
+    A record with other rules or options is designed for anew, with the models that were found.
 
     :param record: the experiment.
     :param tell: not told anything.
@@ -56,7 +69,8 @@ def analysed_once(record: Record, *, tell: object = None, **task: Any) -> Analys
     """
     key = pickle.dumps((record, sorted(task.items())))
     if key not in _FOUND:
-        _FOUND[key] = analyse(record, **task)
+        with patch("relay_autotune.analysis.identify", _identified_once):
+            _FOUND[key] = analyse(record, **task)
     return _FOUND[key]
 
 
