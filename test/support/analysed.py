@@ -19,6 +19,7 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import Identification
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.reasons import NONE
 from relay_autotune.record.record import Outcome, Record, RelaySettings
 from relay_autotune.result import Analysis
 from relay_autotune.verdict import Check, Judgement, Measured, judge
@@ -51,10 +52,11 @@ _MODELS: dict[bytes, Identification] = {}
 _FOUND: dict[bytes, Analysis] = {}
 
 
-def _identified_once(*asked: Any) -> Identification:
-    key = pickle.dumps(asked)
+def _identified_once(record: Record, *asked: Any) -> Identification:
+    # Whose test it was, when, and how it is said to have ended make no other model.
+    key = pickle.dumps((replace(record, experiment_id="", start=0.0, reason="", why=NONE), asked))
     if key not in _MODELS:
-        _MODELS[key] = identify(*asked)
+        _MODELS[key] = identify(record, *asked)
     return _MODELS[key]
 
 
