@@ -177,6 +177,7 @@ def one(name, reference):
 """
 
 
+@pytest.mark.nightly
 def test_recordings_in_a_folder_are_judged_by_the_judge_in_it(tmp_path: Path) -> None:
     time = np.arange(0.0, 60.0, 0.25)
     command = np.where(time < 5.0, 0.0, np.where(time < 30.0, 1.0, -1.0))
