@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pages import ROOT, blocks, commands, rows
+from report_cases import only
 
 from relay_autotune.cli import replay
 from relay_autotune.loop.analysis import analyse_loop
@@ -58,6 +59,7 @@ def write_log(u: PiecewiseConstant) -> None:
 @pytest.mark.by_day(1)
 @pytest.mark.parametrize("by_hand", [by_steps, by_relay])
 def test_a_test_by_hand_gives_gains_that_hold(by_hand, tmp_path, monkeypatch, capsys):
+    only(monkeypatch, "experiment")
     monkeypatch.chdir(tmp_path)
     # The gains are read off one line, whatever the terminal.
     monkeypatch.setenv("COLUMNS", "100")

@@ -64,6 +64,8 @@ def test_the_lines_of_python_go_from_a_log_to_gains_and_a_figure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("control")
+    # The figures of the report take seconds, and have tests of their own.
+    monkeypatch.setattr("relay_autotune.report.page.PLATES", ())
     monkeypatch.chdir(tmp_path)
     Path("bags").symlink_to(ROOT / "bags")
     code = block_noted("docs/install.md", "in Python").text

@@ -52,7 +52,12 @@ _MODELS: dict[bytes, Identification] = {}
 _FOUND: dict[bytes, Analysis] = {}
 
 
-def _identified_once(record: Record, *asked: Any) -> Identification:
+def identified_once(record: Record, *asked: Any) -> Identification:
+    """Identify a record, once for all tests.
+
+    :param record: the experiment.
+    :param asked: further arguments of `identify`.
+    """
     # Whose test it was, when, and how it is said to have ended make no other model.
     key = pickle.dumps((replace(record, experiment_id="", start=0.0, reason="", why=NONE), asked))
     if key not in _MODELS:
@@ -71,7 +76,7 @@ def analysed_once(record: Record, *, tell: object = None, **task: Any) -> Analys
     """
     key = pickle.dumps((record, sorted(task.items())))
     if key not in _FOUND:
-        with patch("relay_autotune.analysis.identify", _identified_once):
+        with patch("relay_autotune.analysis.identify", identified_once):
             _FOUND[key] = analyse(record, **task)
     return _FOUND[key]
 

@@ -16,7 +16,6 @@ from analysed import analysed_once
 from served import REPOSITORY, analysed, subject_of
 
 from relay_autotune import tuning
-from relay_autotune.analysis import analyse
 from relay_autotune.cli import arguments, replay
 from relay_autotune.cli.arguments import as_typed
 from relay_autotune.control.controller import simulate_closed_loop
@@ -58,7 +57,7 @@ def test_gains_and_verdict_are_those_of_an_analysis_with_the_same_options(
     analysis, subject, asked
 ):
     options = asked.options(DesignOptions())
-    expected = analyse(analysis.record, rule=asked.rule, options=options, alone=True)
+    expected = analysed_once(analysis.record, rule=asked.rule, options=options, alone=True)
     found = subject.shaped(asked)
     assert found.gains == expected.best_gains
     assert found.judgement == expected.judgement
