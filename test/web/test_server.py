@@ -175,11 +175,12 @@ def test_no_page_waits_for_the_question_of_another_one(subject):
                 time.sleep(0.01)
             return super().shaped(asked)
 
+    pi = {"controller": "pi"}
     slow = Slow(subject.case, subject.shaping, subject.first, subject.command)
     with served([slow]) as url, ThreadPoolExecutor() as pool:
-        first = pool.submit(conversation, url, {"of": 0, "n": 1, "asked": {"ms": 2.0}})
+        first = pool.submit(conversation, url, {"of": 0, "n": 1, "asked": {**pi, "ms": 2.0}})
         assert slow.begun.wait(60.0)
-        answer = conversation(url, {"of": 0, "n": 2, "asked": {"ms": 1.5}})[1]
+        answer = conversation(url, {"of": 0, "n": 2, "asked": {**pi, "ms": 1.5}})[1]
         assert answer["answer"]["shaped"]["ms"] <= 1.5
         assert not first.done()
         Slow.over = True
@@ -229,10 +230,11 @@ def test_doubtful_gains_are_written_only_when_they_are_accepted(subject, monkeyp
         type(subject.shaping), "judgement", lambda self, gains: Judgement((finding,))
     )
     with served([doubtful]) as url:
-        status, _, text = get(url + "gains/yaml")
+        asked = "gains/yaml?asked=" + quote('{"controller": "pi"}')
+        status, _, text = get(url + asked)
         assert status == 409
         assert "doubtful" in text
-        status, _, text = get(url + "gains/yaml?accept_doubtful=yes")
+        status, _, text = get(url + asked + "&accept_doubtful=yes")
         assert status == 200
         assert "the data drift" in text
 
