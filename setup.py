@@ -32,9 +32,9 @@ setup(
         (f"share/{PACKAGE}/config/security", files("config/security")),
     ],
     python_requires=">=3.11",
-    install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11"],
+    install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11", "mcap"],
     extras_require={
-        "bags": ["mcap", "pyyaml"],
+        "bags": ["pyyaml"],
         "fleet": ["distributed", "pyarrow"],
         "report": ["jinja2", "matplotlib"],
         "web": ["tornado"],

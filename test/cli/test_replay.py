@@ -568,7 +568,7 @@ def test_two_processes_print_the_same_bytes(tmp_path, capsys):
 
 # All that is read or written otherwise: live, as a figure, by others, in IDL, to a bag.
 UNWANTED = {
-    *("rclpy", "std_msgs", "matplotlib", "jinja2", "mcap", "rosbags", "yaml"),
+    *("rclpy", "std_msgs", "matplotlib", "jinja2", "rosbags", "yaml"),
     *("zstandard", "lz4", "concurrent.futures.process", "distributed"),
     *("scipy.signal", "scipy.stats", "scipy.integrate", "scipy.interpolate"),
     *(f"relay_autotune.bag.{name}" for name in ("csv_file", "foreign", "pairing", "writer")),

@@ -113,7 +113,7 @@ def test_executables_go_where_ros_looks():
 
 @pytest.mark.parametrize("page", ["README.md", "docs/install.md"])
 def test_the_line_for_a_laptop_installs_all_that_a_recording_may_need(page: str) -> None:
-    """A bag may be compressed, and mcap brings what reads that."""
+    """Its page, its report and bags that are written need more than what is always there."""
     (asked,) = re.findall(r"^pip install '\.\[(.*)\]'$", (ROOT / page).read_text(), re.MULTILINE)
     optional = ast.literal_eval(setup_arguments()["extras_require"])
     assert set(asked.split(",")) == optional.keys() - {"fleet", "test"}
