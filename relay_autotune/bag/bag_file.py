@@ -24,9 +24,10 @@ from types import ModuleType
 from typing import Any, Self
 
 import numpy as np
+from mcap.opcode import Opcode
 
 from relay_autotune.bag.arrays import IntArray
-from relay_autotune.bag.definitions import find_definition
+from relay_autotune.bag.definitions import Channel, find_definition
 from relay_autotune.bag.limits import (
     LARGEST_CHUNK,
     LARGEST_DEFINITION,
@@ -40,16 +41,14 @@ from relay_autotune.bag.limits import (
 from relay_autotune.bag.mcap_layout import (
     Segment,
     damage_note,
-    is_chunk_there,
     layout_by_summary,
+    record_at,
     scan,
     segment_content,
 )
 from relay_autotune.bag.mcap_records import (
     RECORD,
-    Channel,
     Content,
-    DamageError,
     Messages,
     Sorted,
     indexed_offsets,
@@ -61,8 +60,8 @@ from relay_autotune.bag.source import (
     MAGIC,
     SQLITE_MAGIC,
     ZSTD_MAGIC,
+    DamageError,
     Source,
-    expanding,
     open_regular,
 )
 from relay_autotune.errors import BagError, visible
@@ -144,8 +143,10 @@ class BagFile:
         if messages.payload(0, len(ZSTD_MAGIC)) != ZSTD_MAGIC:
             yield messages
             return
-        with expanding("zstandard") as zstandard:
-            decompressor = zstandard.ZstdDecompressor()
+        # Imported here: few recordings are compressed.
+        import zstandard
+
+        decompressor = zstandard.ZstdDecompressor()
         parts: list[bytes] = []
         kept: list[int] = []
         size, refusal, largest = 0, "", self._source.largest
@@ -194,9 +195,6 @@ def _together(messages: Messages, kept: list[int], parts: list[bytes]) -> Messag
     times = messages.log_time[at], messages.publish_time[at]
     return Messages(b"".join(parts), messages.order[at], *times, begin, end)
 
-
-# Least distance between the beginnings of two records [bytes].
-_SMALLEST_RECORD = 9
 
 # Size up to which segments are joined [bytes]: an array operation on few messages takes as long
 # as one on a thousand.
@@ -256,7 +254,7 @@ class McapFile(BagFile):
         chosen = index.holding(wanted if trusted else None)
         self._source.announce((segment.start, segment.index_end) for segment in chosen)
         # Only the chunks that will be read are checked: on a disk each check takes time.
-        if all(is_chunk_there(self._source, segment) for segment in chosen):
+        if all(record_at(self._source, s.start, s.end) == (Opcode.CHUNK, s.end) for s in chosen):
             return chosen
         self._layout = scan(self._source)
         for note in self._layout.notes:
@@ -288,7 +286,7 @@ class McapFile(BagFile):
                     self._source.count_messages(counts[channel])
                     for part in self._as_sent(channel, messages, f" of {self._name(channel)}"):
                         yield channel, before, part
-                before += size + _SMALLEST_RECORD
+                before += size + RECORD.size
         self._compare(counts)
 
     def _compare(self, counts: dict[int, int]) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.bag.arrays import IntArray
-from relay_autotune.bag.definitions import first_line, message_type
+from relay_autotune.bag.definitions import Channel, first_line, message_type
 from relay_autotune.bag.field_path import (
     NUMBERS,
     Element,
@@ -35,7 +35,7 @@ from relay_autotune.bag.field_path import (
     written,
 )
 from relay_autotune.bag.limits import MOST_ELEMENTS, MOST_STEPS
-from relay_autotune.bag.mcap_records import Channel, Content, values_at
+from relay_autotune.bag.mcap_records import Content, values_at
 from relay_autotune.errors import BagError, FieldError, visible
 
 _ENCAPSULATION = 4

@@ -25,8 +25,28 @@ from pathlib import Path
 
 from relay_autotune.bag.field_path import NUMBERS, Fields, Repeated, Struct, Text, Type
 from relay_autotune.bag.limits import DEEPEST_TYPE, LARGEST_DEFINITION, MOST_FIELDS
-from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.errors import BagError, visible
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A topic as the file declares it.
+
+    :param id: number that its messages carry.
+    :param topic: name.
+    :param type: message type, the name of the schema; empty: unknown.
+    :param encoding: of the messages, such as ``cdr``.
+    :param schema_encoding: such as ``ros2msg``.
+    :param definition: text of the schema.
+    """
+
+    id: int
+    topic: str
+    type: str
+    encoding: str
+    schema_encoding: str
+    definition: bytes
+
 
 _TOKEN = re.compile(
     r"""\s+ | //[^\n]* | /\*.*?\*/                                  # nothing

@@ -10,33 +10,35 @@ front finds what makes sense. The content of a chunk is expanded within limits a
 from __future__ import annotations
 
 import contextlib
-import struct
 import zlib
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from relay_autotune.bag.arrays import IntArray
 from relay_autotune.bag.limits import LARGEST_SUMMARY, LARGEST_WINDOW, MOST_DECLARATIONS
 from relay_autotune.bag.mcap_records import (
-    FOOTER_SIZE,
     RECORD,
     Content,
-    DamageError,
     Declarations,
-    Opcode,
     opcodes,
+    parsed,
     record_offsets,
     summed_up,
-    text,
-    unsigned,
     values_at,
 )
-from relay_autotune.bag.source import MAGIC, Source, expanding, file_records, record_body
+from relay_autotune.bag.source import MAGIC, DamageError, Source, expanding
 
 # What a chunk takes beside its content, compressed or not.
 _CHUNK_OVERHEAD = 1 << 20
+# Size of the pieces in which records outside of chunks are read [bytes].
+_PIECE = 1 << 20
+# Size of the record of a footer [bytes].
+_FOOTER_SIZE = RECORD.size + 20
+# A place behind all that any file holds.
+_FAR = 1 << 60
 
 
 @dataclass(frozen=True)
@@ -45,18 +47,18 @@ class Segment:
 
     :param start: where its first record begins in the file.
     :param end: where its last one ends, or the file if that ends before.
+    :param index_end: where the message indexes that follow it end; 0: there are none.
     :param whole: whether all of it is there.
     :param is_chunk: whether it is a chunk.
     :param channels: those of its messages, where it was gone through.
-    :param index_end: where the message indexes that follow it end; 0: there are none.
     """
 
     start: int
     end: int
-    whole: bool
-    is_chunk: bool
-    channels: frozenset[int] = frozenset()
     index_end: int = 0
+    whole: bool = True
+    is_chunk: bool = True
+    channels: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -87,15 +89,8 @@ class ChunkIndex:
         wanted = np.isin(self.channel, list(channels or ()))
         chosen = (self.count == 0) | (channels is None)
         chosen[np.repeat(np.arange(self.start.size), self.count)[wanted]] = True
-        return [
-            Segment(start, end, whole=True, is_chunk=True, index_end=index_end)
-            for start, end, index_end in zip(
-                self.start[chosen].tolist(),
-                self.end[chosen].tolist(),
-                self.index_end[chosen].tolist(),
-                strict=True,
-            )
-        ]
+        columns = (column[chosen].tolist() for column in (self.start, self.end, self.index_end))
+        return list(map(Segment, *columns))
 
     def lists(self, channels: frozenset[int], counts: dict[int, int]) -> bool:
         """Return whether it lists as many messages as the statistics of the file.
@@ -123,13 +118,19 @@ class Layout:
     segments: list[Segment] = field(default_factory=list)
     index: ChunkIndex | None = None
 
+    def take(self, source: Source, opcode: int, begin: int, end: int) -> None:
+        """Take in a record among the data, if it is one of metadata or statistics.
+
+        :raises DamageError: if it makes no sense, or is larger than such records are.
+        """
+        if opcode in (Opcode.METADATA, Opcode.STATISTICS):
+            if end - begin > LARGEST_SUMMARY:
+                raise DamageError(f"a record of {end - begin} bytes")
+            self.declared.take(opcode, source.read(begin + RECORD.size, end))
+
     def holding(self, channels: frozenset[int]) -> list[Segment]:
         """Return the segments that hold messages of some channels, where it was gone through."""
         return [s for s in self.segments if s.channels & channels]
-
-
-# Times of the first and the last message, size of the content, its checksum.
-_HEAD = struct.Struct("<QQQI")
 
 
 def segment_content(source: Source, segment: Segment) -> Content:
@@ -139,39 +140,29 @@ def segment_content(source: Source, segment: Segment) -> Content:
     :raises BagError: if the chunks of the file together expand to more than a recording does.
     """
     begin, end, largest = segment.start, segment.end, source.largest
-    if not segment.is_chunk:
-        return source.read(begin, end)
     if end - begin > largest + _CHUNK_OVERHEAD:
         raise DamageError(
-            f"a chunk takes {end - begin} bytes, more than the {largest} that --max-chunk allows"
+            f"a {'chunk' if segment.is_chunk else 'message'} takes {end - begin} bytes, more than "
+            f"the {largest} that --max-chunk allows"
         )
+    if not segment.is_chunk:
+        return source.read(begin, end)
+    # Without its head, by which the content of a plain chunk is aligned.
     body = source.read(begin + RECORD.size, end)
     whole = segment.whole and len(body) == end - begin - RECORD.size
-    if len(body) < _HEAD.size + 12:
-        raise DamageError("the head of a chunk is cut")
-    _, _, size, crc = _HEAD.unpack_from(body)
-    compression, at = text(body, _HEAD.size)
-    stored = unsigned(body, at, "<Q")
-    data = memoryview(body)[at + 8 :]
+    chunk = parsed("Chunk", body, whole=whole)
+    size, crc = chunk.uncompressed_size, chunk.uncompressed_crc
     if size > largest:
         raise DamageError(
             f"a chunk declares {size} bytes, more than the {largest} that --max-chunk allows"
         )
-    if whole and stored != len(data):
-        raise DamageError("the lengths of a chunk contradict each other")
-    content = _expand(data, compression, size, whole=whole)
+    content = _expand(chunk.data, chunk.compression, size)
     if whole and len(content) != size:
-        raise DamageError(f"a chunk declares {size} bytes, but does not hold that many")
+        raise DamageError(f"a chunk declares {size} bytes, but does not hold as many")
     if whole and crc and zlib.crc32(content) != crc:
         raise DamageError("the checksum of a chunk is wrong")
     source.count_expanded(len(content))
     return content
-
-
-def is_chunk_there(source: Source, segment: Segment) -> bool:
-    """Return whether a chunk begins where the index says."""
-    head = source.read(segment.start, segment.start + RECORD.size)
-    return head == RECORD.pack(Opcode.CHUNK, segment.end - segment.start - RECORD.size)
 
 
 def damage_note(source: Source, segment: Segment, damage: DamageError) -> str:
@@ -182,168 +173,116 @@ def damage_note(source: Source, segment: Segment, damage: DamageError) -> str:
     )
 
 
-_PACKAGES = {"zstd": "zstandard", "lz4": "lz4.frame"}
-
-
-def _expand(data: memoryview, compression: str, size: int, *, whole: bool) -> bytes | memoryview:
+def _expand(data: memoryview, compression: str, size: int) -> bytes | memoryview:
     """Decompress a chunk, or the part of a cut one.
 
     :param size: declared size; at most one byte more than that is taken.
     """
     if compression == "":
         return data
-    if compression not in _PACKAGES:
+    if compression not in ("zstd", "lz4"):
         raise DamageError(f"a chunk is compressed with {compression!r}; known are zstd and lz4")
-    with expanding(_PACKAGES[compression], "a chunk cannot be decompressed") as package:
+    with expanding("a chunk cannot be decompressed") as zstandard:
         if compression == "lz4":
-            found = package.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
-        elif not whole:
-            decompressor = package.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
-            found = decompressor.stream_reader(data).read(size + 1)
-        elif size == 0:
-            found = b""
-        # zstd allocates at once the size that the frame declares.
-        elif package.frame_content_size(data) not in (-1, size):
-            raise DamageError("a chunk and its compressed content differ in their size")
+            import lz4.frame
+
+            found = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
         else:
-            found = package.ZstdDecompressor().decompress(data, max_output_size=size)
+            # As a stream: at once, zstd allocates the size that the frame declares.
+            decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
+            found = decompressor.stream_reader(data).read(size + 1)
     return bytes(found)
 
 
-# Size of the pieces in which records outside of chunks are read [bytes].
-_PIECE = 4 << 20
+def record_at(source: Source, position: int, stop: int) -> tuple[int, int] | None:
+    """Return opcode and end of the record at a place; None: none that ends up to another place."""
+    head = source.read(position, min(position + RECORD.size, stop))
+    if len(head) < RECORD.size:
+        return None
+    opcode, length = RECORD.unpack(head)
+    end = position + RECORD.size + length
+    return (opcode, end) if opcode and end <= stop else None
+
 
 # Records that declare or hold messages; others are of no use inside of a chunk.
 _INSIDE = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 
 
 class _Scan:
-    """Goes through a file, and looks into each chunk once its message indexes have passed."""
+    """Goes through a file, and looks into each chunk and into what lies outside of any."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
         self.layout = Layout()
         self.count = 0
-        self.first: int | None = None
-        self.last = 0
-        self._chunk: Segment | None = None
+        self.times: list[int] = []
 
     def run(self) -> Layout:
-        source = self.source
-        position, unfinished, torn = len(MAGIC), True, -1
-        while position < source.size:
-            head = source.read(position, position + RECORD.size)
-            if len(head) < RECORD.size:
-                break
-            opcode, length = RECORD.unpack(head)
+        source, segments = self.source, self.layout.segments
+        position, indexed, ended, piece = len(MAGIC), 0, False, _PIECE
+        while record := record_at(source, position, source.size):
+            opcode, end = record
             if opcode in _INSIDE:
-                self._settle()
-                after = self._loose(position)
-                if after == position:
-                    break
-                position = after
-                continue
-            begin = position + RECORD.size
-            end = begin + length
-            if opcode == 0 or end > source.size:
-                torn = position if opcode == Opcode.CHUNK else -1
-                break
-            if opcode == Opcode.MESSAGE_INDEX:
-                if self._chunk is not None:
-                    self._chunk = replace(self._chunk, index_end=end)
+                # One that is larger than a piece is a piece of its own.
+                stop = max(end, min(position + piece, source.size))
+                end = self._look_inside(Segment(position, stop, is_chunk=False))
+                # Little is read in vain where each record is followed by one of no use.
+                piece = min(_PIECE, 1024 + 2 * (end - position))
+            elif opcode == Opcode.CHUNK:
+                indexed = self._look_inside(Segment(position, end))
+            elif opcode == Opcode.MESSAGE_INDEX and position == indexed:
+                segments[-1] = replace(segments[-1], index_end=end)
+                indexed = end
             else:
-                self._settle()
-                if opcode == Opcode.CHUNK:
-                    self._chunk = Segment(position, end, whole=True, is_chunk=True)
-                elif opcode == Opcode.METADATA:
-                    with contextlib.suppress(DamageError):
-                        self.layout.declared.take(opcode, record_body(source, begin, end))
-                elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
-                    unfinished = source.read(source.size - len(MAGIC), source.size) != MAGIC
-                    self._declared_again(end)
-                    break
+                with contextlib.suppress(DamageError):
+                    self.layout.take(source, opcode, position, end)
+            ended |= opcode in (Opcode.DATA_END, Opcode.FOOTER)
             position = end
-        self._settle()
-        if unfinished and torn >= 0:
-            self._look_inside(Segment(torn, source.size, whole=False, is_chunk=True))
-        if unfinished:
+        if not ended or source.read(source.size - len(MAGIC), source.size) != MAGIC:
+            if source.read(position, position + 1) == bytes([Opcode.CHUNK]):
+                self._look_inside(Segment(position, source.size, whole=False))
             self._tell_tear()
         return self.layout
 
-    def _declared_again(self, position: int) -> None:
-        """Take channels and statistics from the end of the file, beside those of the data."""
-        with contextlib.suppress(DamageError):
-            for opcode, begin, end in file_records(self.source, position, self.source.size):
-                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
-                    self.layout.declared.take(opcode, record_body(self.source, begin, end))
-
     def _tell_tear(self) -> None:
         until = ""
-        if self.first is not None:
-            until = f" until {(self.last - self.first) / 1e9:.3f} s after the first"
+        if self.times:
+            seconds = (max(self.times) - min(self.times)) / 1e9
+            until = f" until {seconds:.3f} s after the first"
         self.layout.notes.append(
             f"unfinished recording: {self.source.path.name} ends without its footer; "
             f"it holds {self.count} messages{until}"
         )
 
-    def _settle(self) -> None:
-        """Take the chunk before this place, whose message indexes have all been seen."""
-        chunk, self._chunk = self._chunk, None
-        if chunk is not None:
-            self._look_inside(chunk)
+    def _look_inside(self, segment: Segment) -> int:
+        """Learn what a segment declares, and the channels of its messages; return its end.
 
-    def _look_inside(self, segment: Segment) -> None:
-        """Learn what a chunk declares, and the channels of its messages."""
+        One outside of chunks ends where other records begin.
+        """
         channels: frozenset[int] = frozenset()
         try:
             content = segment_content(self.source, segment)
-            channels = self._declare(content)
+            offsets, size = record_offsets(content)
+            if not segment.is_chunk:
+                outside = np.flatnonzero(~np.isin(opcodes(content, offsets), _INSIDE))
+                if outside.size:
+                    offsets, size = offsets[: outside[0]], int(offsets[outside[0]])
+                # A file that shrinks may have none of them any more.
+                segment = replace(segment, end=segment.start + size if size else segment.end)
+            # Before they take several times the memory of the content.
+            self.source.count_messages(self.count + offsets.size - MOST_DECLARATIONS)
+            own, times, others = summed_up(content, offsets)
+            channels = frozenset(own.tolist())
+            with contextlib.suppress(DamageError):
+                self.layout.declared.take_all(content, others)
+            if times.size:
+                self.count += times.size
+                self.times += [int(times.min()), int(times.max())]
         except DamageError as damage:
-            if not segment.whole:
-                return
-            self.layout.notes.append(damage_note(self.source, segment, damage))
+            if segment.whole:
+                self.layout.notes.append(damage_note(self.source, segment, damage))
         self.layout.segments.append(replace(segment, channels=channels))
-
-    def _declare(self, content: Content) -> frozenset[int]:
-        offsets, _ = record_offsets(content)
-        # Before they take several times the memory of the content.
-        self.source.count_messages(self.count + offsets.size - MOST_DECLARATIONS)
-        channels, times, others = summed_up(content, offsets)
-        with contextlib.suppress(DamageError):
-            self.layout.declared.take_all(content, others)
-        if times.size:
-            self.count += times.size
-            first = int(times.min())
-            self.first = first if self.first is None else min(self.first, first)
-            self.last = max(self.last, int(times.max()))
-        return frozenset(channels.tolist())
-
-    def _loose(self, position: int) -> int:
-        """Take a piece of records outside of chunks; return where the next one begins."""
-        stop = min(position + _PIECE, self.source.size)
-        piece = self.source.read(position, stop)
-        offsets, end = record_offsets(piece)
-        if len(piece) < RECORD.size:
-            return position
-        if end == 0:
-            # A record larger than a piece, or one that is cut.
-            length = unsigned(piece, 1, "<Q")
-            after = position + RECORD.size + length
-            if after > self.source.size:
-                return position
-            if length <= self.source.largest:
-                piece = self.source.read(position, after)
-            return self._take_loose(piece, position, after)
-        outside = np.flatnonzero(~np.isin(opcodes(piece, offsets), _INSIDE))
-        if outside.size:
-            end = int(offsets[outside[0]])
-        return self._take_loose(piece[:end], position, position + end)
-
-    def _take_loose(self, piece: bytes, position: int, end: int) -> int:
-        if len(piece) == end - position:
-            channels = self._declare(piece)
-            self.layout.segments.append(Segment(position, end, True, False, channels))
-        return end
+        return segment.end
 
 
 def scan(source: Source) -> Layout:
@@ -352,149 +291,94 @@ def scan(source: Source) -> Layout:
     return _Scan(source).run()
 
 
-# A chunk index up to its list of message indexes: times of the first and the last message, start
-# and length of the chunk, and the list's length.
-_LIST = 36
-_START, _LENGTH, _LIST_LENGTH = 16, 24, 32
-# One entry of the list: a channel, and the place of its message index.
-_ENTRY = 10
-# Sizes in a message index [bytes]: channel and length of the list; each place.
-_PLACES, _PLACE = 6, 16
-
-
 def layout_by_summary(source: Source) -> Layout | None:
     """Return channels and chunks as the summary has them; None if there is none to trust."""
-    foot = source.size - len(MAGIC) - FOOTER_SIZE - RECORD.size
-    if foot < len(MAGIC):
+    foot = source.size - len(MAGIC) - _FOOTER_SIZE
+    tail = source.read(foot, source.size) if foot >= len(MAGIC) else b""
+    head = RECORD.pack(Opcode.FOOTER, _FOOTER_SIZE - RECORD.size)
+    if tail[: RECORD.size] != head or tail[_FOOTER_SIZE:] != MAGIC:
         return None
-    tail = source.read(foot, source.size)
-    if len(tail) != source.size - foot or tail[-len(MAGIC) :] != MAGIC:
-        return None
-    if RECORD.unpack_from(tail) != (Opcode.FOOTER, FOOTER_SIZE):
-        return None
-    start, _, crc = struct.unpack_from("<QQI", tail, RECORD.size)
+    footer = parsed("Footer", tail[RECORD.size :])
+    start, crc = footer.summary_start, footer.summary_crc
     if not len(MAGIC) <= start < foot or foot - start > LARGEST_SUMMARY:
         return None
     summary = source.read(start, foot)
     # The checksum covers the summary and the footer up to the checksum itself.
-    if crc and crc != zlib.crc32(tail[: RECORD.size + 16], zlib.crc32(summary)):
+    if crc and crc != zlib.crc32(tail[: _FOOTER_SIZE - 4], zlib.crc32(summary)):
         return None
     layout = Layout()
     try:
-        chunks = _take(summary, start, layout)
+        offsets, end = record_offsets(summary)
+        _demand(end == len(summary))
+        layout.declared.take_all(summary, offsets)
+        is_chunk = opcodes(summary, offsets) == Opcode.CHUNK_INDEX
+        layout.index = chunks = _chunks(summary, offsets[is_chunk], start)
         _check_between(source, chunks, start, layout)
+        # Without any, or with a type that may stand among the data, those are gone through.
+        _demand(chunks.start.size > 0, bool(layout.declared.channels))
+        _demand(layout.declared.have_all_types)
     except DamageError:
         return None
-    if not chunks.start.size or not layout.declared.channels:
-        # Messages outside of chunks, or no index of them: they must be looked for.
-        return None
-    if not layout.declared.have_all_types:
-        # A type that is missing here may stand among the data.
-        return None
-    layout.index = chunks
     return layout
-
-
-def _take(summary: bytes, data_end: int, layout: Layout) -> ChunkIndex:
-    """Take in what a summary declares, and return its chunks."""
-    offsets, end = record_offsets(summary)
-    if end != len(summary):
-        raise DamageError(f"a record of impossible length at {end}")
-    is_chunk = opcodes(summary, offsets) == Opcode.CHUNK_INDEX
-    for at in offsets[~is_chunk].tolist():
-        opcode, length = RECORD.unpack_from(summary, at)
-        begin = at + RECORD.size
-        layout.declared.take(opcode, summary[begin : begin + length])
-    return _chunks(summary, offsets[is_chunk], data_end)
 
 
 def _chunks(summary: bytes, offsets: IntArray, data_end: int) -> ChunkIndex:
     """Return the chunks of an index.
+
+    An object of the package mcap for each takes seven times as long, and a bag may have very many.
 
     :param summary: the records at the end of the file.
     :param offsets: where each chunk index begins in it, shape (n,).
     :param data_end: where the data end in the file.
     :raises DamageError: if one of them leads out of the data, or two overlap.
     """
-    size = values_at(summary, "<u8", offsets + 1)
-    body = offsets + RECORD.size
-    # The length of the message indexes follows the list.
-    if bool((size < _LIST + 8).any()):
-        raise DamageError("a record is cut")
-    start, length = (
-        values_at(summary, "<u8", body + _START),
-        values_at(summary, "<u8", body + _LENGTH),
-    )
-    _demand(
-        start >= len(MAGIC),
-        length > RECORD.size,
-        length <= data_end,
-        start + np.minimum(length, data_end) <= data_end,
-        start <= data_end,
-        otherwise="a chunk outside of the data",
-    )
-    listed = values_at(summary, "<u4", body + _LIST_LENGTH).astype(np.int64)
-    _demand(
-        listed <= size.astype(np.int64) - _LIST - 8,
-        listed % _ENTRY == 0,
-        otherwise="a list of message indexes of impossible length",
-    )
-    indexed = values_at(summary, "<u8", body + _LIST + listed)
-    end = (start + length).astype(np.int64)
-    _demand(
-        indexed <= (data_end - end).astype(np.uint64),
-        otherwise="message indexes outside of the data",
-    )
-    index_end = end + indexed.astype(np.int64)
-    order = np.argsort(start, kind="stable")
-    body, listed, index_end, end = body[order], listed[order], index_end[order], end[order]
-    channel, room = _entries(summary, body + _LIST, listed // _ENTRY, end, index_end)
-    begin = start[order].astype(np.int64)
-    _demand(begin[1:] >= index_end[:-1], otherwise="chunks that overlap")
-    return ChunkIndex(begin, end, index_end, listed // _ENTRY, channel, room // _PLACE)
 
+    def column(form: str, places: IntArray) -> IntArray:
+        # Cut to what no sum of them overflows with.
+        found = values_at(summary, form, places).astype(np.uint64)
+        return np.minimum(found, np.uint64(_FAR)).astype(np.int64)
 
-def _entries(
-    summary: bytes, lists: IntArray, count: IntArray, end: IntArray, index_end: IntArray
-) -> tuple[IntArray, IntArray]:
-    """Return channel and room for entries [bytes] of the message indexes of all chunks.
-
-    :param summary: the records at the end of the file.
-    :param lists: where the list of each chunk begins in it, shape (n,).
-    :param count: number of its entries, shape (n,).
-    :param end: where each chunk ends in the file, shape (n,).
-    :param index_end: where its message indexes end, shape (n,).
-    :raises DamageError: if one does not lie behind its chunk.
-    """
+    # Behind the head: times of the first and the last message, start and length of the chunk,
+    # bytes of a list of channels and places of message indexes, the list, length of those.
+    size, body = column("<u8", offsets + 1), offsets + RECORD.size
+    _demand(size >= 44)
+    order = np.argsort(column("<u8", body + 16), kind="stable")
+    size, body = size[order], body[order]
+    start, length = column("<u8", body + 16), column("<u8", body + 24)
+    listed, entries = column("<u4", body + 32), body + 36
+    _demand(listed <= size - 44, listed % 10 == 0)
+    end, count = start + length, listed // 10
+    index_end = end + column("<u8", entries + listed)
+    _demand(start >= len(MAGIC), length > RECORD.size)
+    _demand(index_end <= np.append(start[1:], data_end))
     before = np.cumsum(count) - count
-    at = np.repeat(lists - _ENTRY * before, count) + _ENTRY * np.arange(int(count.sum()))
-    channel = values_at(summary, "<u2", at).astype(np.int64)
-    place = values_at(summary, "<u8", at + 2)
-    _demand(
-        place >= np.repeat(end, count).astype(np.uint64),
-        place < np.repeat(index_end, count).astype(np.uint64),
-        otherwise="a message index that does not follow its chunk",
-    )
+    at = np.repeat(entries - 10 * before, count) + 10 * np.arange(int(count.sum()))
+    channel, place = column("<u2", at), column("<u8", at + 2)
+    _demand(place >= np.repeat(end, count), place < np.repeat(index_end, count))
     # A message index ends where the next one of its chunk begins.
-    begin, room = place.astype(np.int64), np.empty(place.size, dtype=np.int64)
-    order = np.argsort(begin, kind="stable")
-    ends = np.append(begin[order][1:], np.iinfo(np.int64).max)
-    room[order] = np.minimum(ends, np.repeat(index_end, count)[order]) - begin[order]
-    return channel, np.maximum(room - RECORD.size - _PLACES, 0)
+    order = np.argsort(place, kind="stable")
+    ends = np.minimum(np.append(place[order][1:], _FAR), np.repeat(index_end, count)[order])
+    room = np.empty_like(place)
+    room[order] = ends - place[order]
+    # 15 bytes before the entries, and 16 for each.
+    return ChunkIndex(start, end, index_end, count, channel, np.maximum(room - 15, 0) // 16)
 
 
-def _demand(*conditions: NDArray[np.bool_], otherwise: str) -> None:
-    if not all(bool(condition.all()) for condition in conditions):
-        raise DamageError(otherwise)
+def _demand(*conditions: NDArray[np.bool_] | bool) -> None:
+    if not all(np.all(condition) for condition in conditions):
+        raise DamageError("an index that makes no sense")
 
 
 def _check_between(source: Source, chunks: ChunkIndex, data_end: int, layout: Layout) -> None:
     """Check that the index lists all data, and read the metadata between the chunks."""
     begins = np.append(len(MAGIC), chunks.index_end)
-    ends = np.append(chunks.start, data_end)
-    for gap in np.flatnonzero(begins < ends).tolist():
-        for opcode, begin, end in file_records(source, int(begins[gap]), int(ends[gap])):
-            if opcode in (Opcode.CHUNK, Opcode.MESSAGE):
-                raise DamageError("data that the index does not know")
-            if opcode == Opcode.METADATA:
-                layout.declared.take(opcode, record_body(source, begin, end))
+    stops = np.append(chunks.start, data_end)
+    gaps = begins < stops
+    for begin, stop in zip(begins[gaps].tolist(), stops[gaps].tolist(), strict=True):
+        position = begin
+        while record := record_at(source, position, stop):
+            opcode, end = record
+            _demand(opcode not in (Opcode.CHUNK, Opcode.MESSAGE))
+            layout.take(source, opcode, position, end)
+            position = end
+        _demand(position == stop)

@@ -15,84 +15,59 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from relay_autotune.bag.arrays import IntArray
+from relay_autotune.bag.definitions import Channel
 from relay_autotune.bag.limits import MOST_DECLARATIONS, MOST_DECLARED
+from relay_autotune.bag.source import DamageError
 from relay_autotune.errors import BagError, visible
-
-
-class Opcode:
-    """The kinds of records that are read."""
-
-    FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 0x02, 0x03, 0x04, 0x05, 0x06
-    MESSAGE_INDEX, CHUNK_INDEX, STATISTICS = 0x07, 0x08, 0x0B
-    METADATA, DATA_END = 0x0C, 0x0F
-
 
 RECORD = struct.Struct("<BQ")
 # Channel, sequence, log time and publish time, before the message itself.
 MESSAGE_HEAD_SIZE = 22
-FOOTER_SIZE = 20
+
+Content = bytes | memoryview
 
 
-class DamageError(Exception):
-    """Bytes that are no MCAP records."""
+class _Fields:
+    """What the package mcap reads a record from; by itself it takes a cut field for whole.
 
-
-def unsigned(data: bytes, at: int, form: str) -> int:
-    """Return the number at a place of a record."""
-    if at + struct.calcsize(form) > len(data):
-        raise DamageError("a record is cut")
-    return int(struct.unpack_from(form, data, at)[0])
-
-
-def sized_bytes(data: bytes, at: int) -> tuple[bytes, int]:
-    """Return the bytes after their length, and the place after them."""
-    length = unsigned(data, at, "<I")
-    if length > len(data) - at - 4:
-        raise DamageError("a text is longer than its record")
-    return data[at + 4 : at + 4 + length], at + 4 + length
-
-
-def text(data: bytes, at: int) -> tuple[str, int]:
-    """Return the text after its length, made visible, and the place after it."""
-    raw, at = sized_bytes(data, at)
-    try:
-        return visible(raw.decode("utf-8")), at
-    except UnicodeDecodeError:
-        raise DamageError("a name is not UTF-8") from None
-
-
-def map_of_text(data: bytes, at: int) -> tuple[dict[str, str], int]:
-    """Return the texts by their names, and the place after them."""
-    body, after = sized_bytes(data, at)
-    found: dict[str, str] = {}
-    at = 0
-    while at < len(body):
-        key, at = text(body, at)
-        found[key], at = text(body, at)
-    return found, after
-
-
-@dataclass(frozen=True)
-class Channel:
-    """A topic as the file declares it.
-
-    :param id: number that its messages carry.
-    :param topic: name.
-    :param type: message type, the name of the schema; empty: unknown.
-    :param encoding: of the messages, such as ``cdr``.
-    :param schema_encoding: such as ``ros2msg``.
-    :param definition: text of the schema.
+    :param content: of the record.
+    :param whole: whether all of it is there.
     """
 
-    id: int
-    topic: str
-    type: str
-    encoding: str
-    schema_encoding: str
-    definition: bytes
+    def __init__(self, content: Content, whole: bool) -> None:
+        self._content, self._whole, self._at = memoryview(content), whole, 0
+
+    def read(self, length: int) -> memoryview:
+        """Return the next bytes, without a copy."""
+        begin, self._at = self._at, self._at + length
+        data = self._content[begin : self._at]
+        if self._whole and len(data) < length:
+            raise DamageError("a record is cut")
+        return data
+
+
+def parsed(kind: str, content: Content, *, whole: bool = True) -> Any:
+    """Return a record as the package mcap reads it.
+
+    :param kind: name of its class there.
+    :param content: of the record, which its binary fields are part of.
+    :param whole: whether all of it is there; if not, its last field may be cut.
+    :raises DamageError: if it makes no sense.
+    """
+    # Imported here: a command that reads no bag starts sooner.
+    from mcap import data_stream, exceptions, records
+
+    stream: Any = _Fields(content, whole)
+    try:
+        return getattr(records, kind).read(data_stream.ReadDataStream(stream))
+    except UnicodeDecodeError:
+        raise DamageError("a name is not UTF-8") from None
+    except (struct.error, exceptions.EndOfFile):
+        raise DamageError("a record is cut") from None
 
 
 _DECLARING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.STATISTICS)
@@ -137,17 +112,16 @@ class Declarations:
             f"metadata, or more than {MOST_DECLARED} bytes of them; expected a recording"
         )
 
-    def take_all(self, content: bytes | memoryview, offsets: IntArray) -> None:
-        """Take in those of the records inside of a chunk that declare channels.
+    def take_all(self, content: Content, offsets: IntArray) -> None:
+        """Take in those of some records that declare anything.
 
         :param content: the records.
         :param offsets: where each begins, shape (n,).
-        :raises DamageError: if one contradicts itself; the others are taken in.
+        :raises DamageError: if one makes no sense; the others are taken in.
         :raises BagError: if there are too many.
         """
-        kinds = opcodes(content, offsets)
         damage: DamageError | None = None
-        declaring = offsets[(kinds == Opcode.SCHEMA) | (kinds == Opcode.CHANNEL)]
+        declaring = offsets[np.isin(opcodes(content, offsets), _DECLARING)]
         if declaring.size > MOST_DECLARATIONS:
             raise self._too_many()
         for at in declaring.tolist():
@@ -161,47 +135,35 @@ class Declarations:
             raise damage
 
     def take(self, opcode: int, body: bytes) -> None:
-        """Take in a record, if it declares anything.
+        """Take in a record that declares something.
 
-        :raises DamageError: if it contradicts itself.
+        :raises DamageError: if it makes no sense.
         :raises BagError: if there are too many.
         """
-        if opcode not in _DECLARING:
-            return
         if (opcode, body) in self._taken:
             return
         self._size += len(body)
         if len(self._taken) >= MOST_DECLARATIONS or self._size > MOST_DECLARED:
             raise self._too_many()
         self._taken.add((opcode, body))
+        it = parsed(Opcode(opcode).name.title(), body)
         if opcode == Opcode.SCHEMA:
-            number = unsigned(body, 0, "<H")
-            name, at = text(body, 2)
-            encoding, at = text(body, at)
-            definition, _ = sized_bytes(body, at)
-            schema = (name, encoding, definition)
-            if self._schemas.setdefault(number, schema) != schema:
-                self.contradictions.append(f"two different types have the number {number}")
+            schema = (visible(it.name), visible(it.encoding), bytes(it.data))
+            if self._schemas.setdefault(it.id, schema) != schema:
+                self.contradictions.append(f"two different types have the number {it.id}")
         elif opcode == Opcode.CHANNEL:
-            number, schema_number = unsigned(body, 0, "<H"), unsigned(body, 2, "<H")
-            topic, at = text(body, 4)
-            channel = (topic, schema_number, text(body, at)[0])
-            first = self._channels.setdefault(number, channel)
+            channel = (visible(it.topic), it.schema_id, visible(it.message_encoding))
+            first = self._channels.setdefault(it.id, channel)
             if first != channel:
                 self.contradictions.append(
-                    f"channel {number} is declared as {first[0]} and, differently, as {topic}"
+                    f"channel {it.id} is declared as {first[0]} and, differently, as {channel[0]}"
                 )
         elif opcode == Opcode.METADATA:
-            name, at = text(body, 0)
-            self.metadata.append((name, map_of_text(body, at)[0]))
+            about = {visible(key): visible(value) for key, value in it.metadata.items()}
+            self.metadata.append((visible(it.name), about))
         elif self.message_counts is None:
-            counts, _ = sized_bytes(body, 42)
-            if len(counts) % 10:
-                raise DamageError("statistics of impossible length")
-            self.message_counts = dict(struct.iter_unpack("<HQ", counts))
+            self.message_counts = it.channel_message_counts
 
-
-Content = bytes | memoryview
 
 _HEAD = np.dtype(
     [
@@ -217,6 +179,9 @@ _LENGTH = struct.Struct("<Q")
 # A message index: its channel, the bytes of its entries, and these.
 _INDEX_HEAD = struct.Struct("<HI")
 _INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+
+# numpy compares with a plain number eight times as fast.
+_MESSAGE = int(Opcode.MESSAGE)
 
 # Records of one size that must follow each other before a longer run of them is looked for.
 _RUN = 4
@@ -430,7 +395,7 @@ def _message_heads(
     content: Content, offsets: IntArray
 ) -> tuple[IntArray, NDArray[Any], IntArray, int]:
     """Return where messages begin, and their heads; where others do; the number of short ones."""
-    is_message = opcodes(content, offsets) == Opcode.MESSAGE
+    is_message = opcodes(content, offsets) == _MESSAGE
     others, places = offsets[~is_message], _chosen(offsets, is_message)
     # Nearer to the end of the content only one that is too short begins.
     last = len(content) - _HEAD.itemsize
@@ -484,7 +449,7 @@ def listed_records(
         if not bool((at[1:] > at[:-1]).all()) or int(at[0]) < 0 or int(at[-1]) > last:
             return None
         heads = _heads(content, at)
-        right = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == channel)
+        right = (heads["opcode"] == _MESSAGE) & (heads["channel"] == channel)
         # One beyond the signed range is negative here, and behind the content without a sign.
         length = heads["length"].astype(np.int64)
         end = at + length

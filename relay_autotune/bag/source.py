@@ -11,7 +11,6 @@ import shutil
 import stat
 import tempfile
 from collections.abc import Iterable, Iterator
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import BinaryIO
@@ -19,13 +18,11 @@ from typing import BinaryIO
 from relay_autotune.bag.limits import (
     FREE_DISK,
     LARGEST_CHUNK,
-    LARGEST_SUMMARY,
     LARGEST_WINDOW,
     MOST_EXPANSION,
     MOST_MESSAGES,
     UNSUSPICIOUS,
 )
-from relay_autotune.bag.mcap_records import RECORD, DamageError
 from relay_autotune.errors import BagError, system_says
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -45,6 +42,10 @@ _TABLES = (
     (b"PK\x03\x04", "a zip archive, as workbooks are; save the table as CSV"),
     (b"MATLAB ", "a MATLAB file; save time, measurement and command as CSV"),
 )
+
+
+class DamageError(Exception):
+    """Bytes of a recording that make no sense."""
 
 
 def open_regular(path: Path) -> BinaryIO:
@@ -207,7 +208,7 @@ class Source:
                 self._file = tempfile.TemporaryFile(prefix="relay_autotune_")  # noqa: SIM115
                 room = shutil.disk_usage(tempfile.gettempdir()).free - FREE_DISK
                 written = 0
-                with expanding("zstandard") as zstandard:
+                with expanding() as zstandard:
                     decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
                     stream = decompressor.stream_reader(compressed)
                     while piece := stream.read(1 << 20):
@@ -233,54 +234,16 @@ class Source:
             raise BagError(f"cannot expand {self.path}: {system_says(error)}") from error
 
 
-def file_records(source: Source, position: int, stop: int) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, begin and end of each record between two places of a file.
-
-    :raises DamageError: if a record is longer than what is left.
-    """
-    while position < stop:
-        head = source.read(position, min(position + RECORD.size, stop))
-        if len(head) == RECORD.size:
-            opcode, length = RECORD.unpack(head)
-            begin = position + RECORD.size
-            if opcode != 0 and length <= stop - begin:
-                yield opcode, begin, begin + length
-                position = begin + length
-                continue
-        raise DamageError(f"a record of impossible length at {position}")
-
-
-def record_body(source: Source, begin: int, end: int) -> bytes:
-    """Return the content of a record that declares something.
-
-    :raises DamageError: if it is larger than such records are.
-    """
-    if end - begin > LARGEST_SUMMARY:
-        raise DamageError(f"a record of {end - begin} bytes")
-    return source.read(begin, end)
-
-
 @contextlib.contextmanager
-def expanding(name: str, what: str = "") -> Iterator[ModuleType]:
-    """Give a package that expands, imported only where a compressed recording is met.
+def expanding(what: str = "") -> Iterator[ModuleType]:
+    """Give zstandard, imported only where a compressed recording is met.
 
-    :param name: such as ``zstandard`` or ``lz4.frame``.
-    :param what: cannot be expanded if the package raises an error, for the message.
-    :raises DamageError: in place of the package's own errors.
-    :raises BagError: if it is not installed.
+    :param what: cannot be expanded if it, or lz4, raises an error, for the message.
+    :raises DamageError: in place of their errors.
     """
+    import zstandard
+
     try:
-        package = import_module(name)
-    except ImportError:
-        package_name = name.split(".", 1)[0]
-        raise BagError(
-            f"the recording is compressed; to read it install the Python package {package_name}, "
-            f"with: pip install {package_name}"
-        ) from None
-    own: tuple[type[Exception], ...] = (RuntimeError, EOFError, MemoryError)
-    if name == "zstandard":
-        own = (package.ZstdError, MemoryError)
-    try:
-        yield package
-    except own as error:
+        yield zstandard
+    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
         raise DamageError(f"{what} ({error})" if what else str(error)) from None

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from relay_autotune.bag.arrays import FloatArray, IntArray
 from relay_autotune.bag.bag_file import BagFile
 from relay_autotune.bag.cdr import Path, decode_messages, decoded_message
-from relay_autotune.bag.definitions import message_type
+from relay_autotune.bag.definitions import Channel, message_type
 from relay_autotune.bag.field_path import (
     UNITS,
     Number,
@@ -33,7 +33,7 @@ from relay_autotune.bag.field_path import (
     unit_of_field,
 )
 from relay_autotune.bag.limits import MOST_DEFINITIONS, MOST_EXPECTED
-from relay_autotune.bag.mcap_records import Channel, Messages
+from relay_autotune.bag.mcap_records import Messages
 from relay_autotune.bag.signals import SignalReader, TimedSignal
 from relay_autotune.errors import BagError, FieldError, SelectionError
 

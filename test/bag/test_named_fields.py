@@ -12,9 +12,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from relay_autotune.bag.bag_file import McapFile
 from relay_autotune.bag.cdr import Path
-from relay_autotune.bag.definitions import message_type
+from relay_autotune.bag.definitions import Channel, message_type
 from relay_autotune.bag.field_path import reading, some_numbers, steps_of
-from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.topics import Topics
 from relay_autotune.errors import BagError, FieldError, SelectionError
 

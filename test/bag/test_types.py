@@ -17,12 +17,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from relay_autotune.bag.bag_file import McapFile
 from relay_autotune.bag.cdr import decode_messages
 from relay_autotune.bag.definitions import (
+    Channel,
     installed_prefixes,
     message_type,
     types_from_ros2msg,
 )
 from relay_autotune.bag.field_path import Number, Repeated, Text, numeric_paths
-from relay_autotune.bag.mcap_records import Channel
 from relay_autotune.bag.topics import Topics, named_field, only_field
 from relay_autotune.errors import BagError, SelectionError
 

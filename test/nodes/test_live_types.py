@@ -14,8 +14,7 @@ from geometry_msgs.msg import TwistStamped
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Byte, Float64
 
-from relay_autotune.bag.definitions import find_definition, message_type
-from relay_autotune.bag.mcap_records import Channel
+from relay_autotune.bag.definitions import Channel, find_definition, message_type
 from relay_autotune.errors import FieldError, ParameterError
 from relay_autotune.nodes import gains_place
 from relay_autotune.nodes.live_types import command_reader, reader_of, struct_of
