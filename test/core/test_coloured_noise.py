@@ -152,7 +152,7 @@ def test_correlated_noise_beside_a_relay_test(pole, seed):
     assert abs(found.ultimate_gain - true.gain) < 3.5 * found.ultimate_gain_std
 
 
-def test_in_a_colour_structures_are_weighted_by_akaikes_criterion():
+def test_structures_are_weighted_by_akaikes_criterion():
     rng = np.random.default_rng(5)
     record = relay_test(0.09 * correlated(0.9, 1400, rng), np.zeros(1400))
     problem = problem_of([(record.time, record.measurement, record.drive())], FOPDT)

@@ -265,8 +265,6 @@ def test_a_response_that_turns_only_after_the_record_is_unobservable():
 
 
 def test_the_support_of_candidates_that_are_not_in_order():
-    found = support(
-        [SimpleNamespace(score=c, bic_minus_aic=0.0) for c in (-36500.0, -38748.0, -38746.0)]
-    )
+    found = support([SimpleNamespace(akaike=c) for c in (-36500.0, -38748.0, -38746.0)])
     assert found[0] == pytest.approx(0.0, abs=1e-300)
     assert found[1] == pytest.approx(1.0 / (1.0 + math.exp(-1.0)))

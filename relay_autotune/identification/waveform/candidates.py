@@ -109,25 +109,20 @@ class Candidate:
         return self.problem.structure
 
     @property
-    def bic_minus_aic(self) -> float:
-        """What Schwarz's penalty exceeds Akaike's by, where the noise has a colour."""
-        if self.problem.colour is None:
-            return 0.0
-        n = max(self.problem.time.size, 3)
-        return self.state.parameters * (math.log(n) - 2.0)
+    def akaike(self) -> float:
+        """The score with Akaike's penalty, 2 for each parameter, in place of log n."""
+        return self.score - self.state.parameters * (math.log(max(self.problem.time.size, 3)) - 2)
 
 
 def support(candidates: Sequence[Candidate]) -> list[float]:
-    """Return the weight of each candidate, ``exp(-score/2)``; their sum is 1.
+    """Return the weight of each candidate, ``exp(-AIC/2)``; their sum is 1.
 
-    White noise leaves nothing that another structure would explain, and the score is that of
-    the choice. In a colour, some of the residual may be what no structure explains: Akaike's
-    penalty, 2 for each parameter, stands in the place of Schwarz's, so that richer structures
-    count (Burnham and Anderson 2002).
+    Schwarz's penalty chooses the true structure where it is among them. But no process is exactly
+    one of them, so that richer ones count beside it (Burnham and Anderson 2002).
 
     :param candidates: in any order.
     """
-    scores = np.array([c.score - c.bic_minus_aic for c in candidates])
+    scores = np.array([c.akaike for c in candidates])
     weights = np.exp(-0.5 * np.minimum(scores - scores.min(), 1400.0))
     return [float(w) for w in weights / weights.sum()]
 
