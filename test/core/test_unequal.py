@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from scipy.integrate import odeint
 
+from relay_autotune import Known
 from relay_autotune.control.controller import PidController
 from relay_autotune.identification.methods import identify
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import SOPDT, UNSTABLE_FOPDT
+from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import PiecewiseConstant, Record
@@ -117,3 +119,18 @@ def test_a_dead_zone_is_the_lower_end_of_what_is_answered():
     found = identify(Record(time, response(process, time, felt) + noise, command))
     assert found.model.gain == pytest.approx(process.gain, rel=0.03)
     assert found.ends[0] == pytest.approx(2.0, abs=0.15)
+
+
+def test_effects_are_told_apart_where_there_are_levels_on_both_sides():
+    """The first of a hundred levels is near their end: all others are on one side of it."""
+    rng, time = np.random.default_rng(0), np.arange(2000.0)
+    levels = np.append(0.02, rng.uniform(0.0, 2.4, 99))
+    curve = levels - 0.1 * levels**2
+    u, felt = (
+        PiecewiseConstant(20.0 * np.arange(1, 100), of[1:], float(of[0])) for of in (levels, curve)
+    )
+    y = response(TransferFunction.fopdt(4.0, 30.0, 2.0), time, felt)
+    y = y + rng.normal(0.0, 0.05, time.size)
+    found = identify(Record(time, y, u(time)), known=Known(structure="fopdt"))
+    assert found.middle == pytest.approx(1.2, abs=0.1)
+    assert found.model.gain == pytest.approx(4.0 * (1.0 - 0.2 * found.middle), rel=0.03)

@@ -32,6 +32,8 @@ _INSTANTS = 60
 # Least play, friction or shift of an end that counts, as a share of the command's range: the steps
 # of a sensor look like a tenth.
 _LEAST = 0.01
+# Share of a command's levels that tell nothing of the effect on their side.
+_ONE_SIDE = 0.05
 
 
 @dataclass(frozen=True)
@@ -418,11 +420,12 @@ def is_above(u: Input, level: float) -> PiecewiseConstant:
 def middle_of(u: Input) -> float:
     """Return the command above and below which effects may differ [u].
 
-    It is the first one, or half the range where the command stays on one side of that.
+    It is the first one, or half the range where nearly all levels are on one side of that.
     """
     assert isinstance(u, PiecewiseConstant)
-    low, high = float(u.levels.min()), float(u.levels.max())
-    return u.initial if low < u.initial < high else 0.5 * (low + high)
+    low, high = np.quantile(u.levels, (_ONE_SIDE, 1.0 - _ONE_SIDE))
+    middle = 0.5 * (float(u.levels.min()) + float(u.levels.max()))
+    return u.initial if low < u.initial < high else middle
 
 
 def distance(u: Input, level: float) -> PiecewiseConstant:
