@@ -76,6 +76,23 @@ def test_a_process_as_fast_as_its_samples_stands_at_no_stop(tau, dead_time):
     assert found.model.gain == pytest.approx(1.0, rel=0.01)
 
 
+def test_a_motor_that_is_back_at_a_speed_which_it_had_stands_at_no_stop():
+    """It turns around sooner than it brakes, of which the model of what came before is."""
+    time, rng = 0.02 * np.arange(1000), np.random.default_rng(1)
+    u, y, speed = np.empty(1000), np.empty(1000), 1250.0
+    parts = [
+        *((0, 250.0, 1250.0, 0.07), (160, -150.0, -900.0, 0.12), (480, -200.0, -1050.0, 0.12)),
+        *((640, 250.0, 1250.0, 0.02), (820, -150.0, -900.0, 0.12)),
+    ]
+    for begin, level, goal, tau in parts:
+        u[begin:] = level
+        y[begin:] = goal + (speed - goal) * np.exp(-(time[begin:] - time[begin]) / tau)
+        speed = goal
+    y += rng.normal(0.0, 10.0, time.size)
+    found = identify(Record(time, y, u), known=Known(structure="fopdt"))
+    assert not told_of_a_stop(found)
+
+
 def test_a_process_that_came_to_rest_in_a_gap_of_the_rows_stands_at_no_stop():
     whole = recorded(LAG, [3.0, 8.0], [1.0, 0.0])
     kept = (TIME < 3.8) | (TIME > 6.5)

@@ -229,8 +229,13 @@ def _before_stop(problem: Problem, chosen: Choose) -> tuple[Problem, str]:
     for begin, stop, away in at_its_ends(smooth(problem.y), band):
         before = problem.part(slice(0, begin))
         held = problem.time[begin : (begin + stop) // 2]
-        if not changes_within(u, before.time).size or changes_within(u, held).size:
+        changes = changes_within(u, before.time)
+        if not changes.size or changes_within(u, held).size:
             # A controller, or a further command, may have made it stay.
+            continue
+        earlier = (before.time < changes[-1]) & (u(before.time) == u(held)[0])
+        if np.any(np.abs(before.y[earlier] - problem.y[begin]) <= band):
+            # The same command held it there before: it comes to rest.
             continue
         try:
             # Any model that follows the record tells whether it moves on.
