@@ -263,6 +263,15 @@ def test_noise_shows_no_response_whichever_fits_to_it_run_off(seed):
             identify_waveform(record, known)
 
 
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.nightly)])
+def test_a_response_within_one_sample_is_named(seed):
+    """Candidates that show dynamics explain nothing of it."""
+    rng, time = np.random.default_rng(seed), np.arange(400.0)
+    command = np.repeat(rng.choice([0.0, 1.0, 2.0], 20), 20)
+    with pytest.raises(IdentificationError, match=r"within one sample, 1\.0 s"):
+        identify_waveform(Record(time, 3.0 * command + rng.normal(0.0, 0.05, 400), command))
+
+
 def test_an_unknown_structure_is_refused():
     with pytest.raises(ParameterError, match="structure is 'ladder', expected one of fopdt"):
         identify_waveform(_staircase()[2], Known(structure="ladder"))

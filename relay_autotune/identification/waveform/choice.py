@@ -63,6 +63,7 @@ from relay_autotune.process.structures import (
 )
 from relay_autotune.record.excitation import answering_time
 from relay_autotune.record.record import PiecewiseConstant
+from relay_autotune.text import digits
 
 # Order in which structures are fitted: first those that show which others are hopeless.
 TRIED = tuple(
@@ -111,6 +112,22 @@ _ROWS, _AHEAD = 2.0, 20.0
 _LATEST = 0.5
 
 
+class NoResponseError(IdentificationError):
+    """No response explains the record.
+
+    :param known: the structure, if it is known.
+    """
+
+    def __init__(self, known: Known) -> None:
+        may = f", or leave the structure open: it may not be {known.structure}"
+        super().__init__(
+            "the measurement shows no response to the command beyond its noise and a slow "
+            "disturbance: record from a rest on, raise the amplitude, move the command more "
+            "often, and check that both topics belong to one "
+            f"loop{may if known.structure else ''}"
+        )
+
+
 def chosen_fit(
     problem: Problem,
     known: Known,
@@ -131,7 +148,8 @@ def chosen_fit(
     :param held: True: a relay held the process, so that it may be unstable.
     :param among: names of the structures, where none is known.
     :param before: what was chosen for nearly the same samples, from which the search goes on, too.
-    :raises IdentificationError: if no structure explains the record.
+    :raises NoResponseError: if no structure explains the record.
+    :raises IdentificationError: if the response is within one sample.
     """
     if not held:
         parts = zip(problem.experiments, problem.inputs, strict=True)
@@ -139,6 +157,7 @@ def chosen_fit(
         problem = replace(problem, latest=_LATEST * longest)
     few = _dense_enough(problem, sign, held)
     found = _compared(few, known, among, before)
+    _require_dynamics(few, found)
     dense = problem.thinned(_MOST_WHITE)
     if found and dense.time.size > few.problem.time.size:
         found = _on_more_samples(replace(few, problem=dense), found)
@@ -162,7 +181,7 @@ def chosen_fit(
         finished = (_finished(c, found, problem, scale) for c in ranked)
         fits += itertools.islice((fit for fit in finished if fit is not None), 1)
     if not fits:
-        raise no_response(known)
+        raise NoResponseError(known)
     # Before a jump or without spikes the best simulation may: it shows these.
     *first, last = fits
     best = next((f for f in first if odds_of_response(f.problem, f.state) > ANSWERED), last)
@@ -191,17 +210,18 @@ def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candid
     return sorted(again, key=lambda c: c.score) or found
 
 
-def no_response(known: Known) -> IdentificationError:
-    """Return the error of a record that no response explains.
-
-    :param known: the structure, if it is known.
-    """
-    may = f", or leave the structure open: it may not be {known.structure}"
-    return IdentificationError(
-        "the measurement shows no response to the command beyond its noise and a slow "
-        "disturbance: record from a rest on, raise the amplitude, move the command more often, "
-        f"and check that both topics belong to one loop{may if known.structure else ''}"
-    )
+def _require_dynamics(context: FitContext, found: Sequence[Candidate]) -> None:
+    """Raise an error where a response within one sample explains most, and no candidate does."""
+    problem, fopdt = context.problem, context.fopdt
+    if unit_steps(FOPDT, fopdt.theta)[-1] > problem.shortest:
+        return
+    left, total = left_in_simulation(problem, fopdt.coefficients, fopdt.theta)
+    if left < 0.5 * total and all(mean_square_left(c) > _WORSE * left**2 for c in found):
+        raise IdentificationError(
+            "the measurement follows the command within one sample, "
+            f"{digits(problem.shortest, 2)} s, and shows no dynamics: sample faster; if there are "
+            "none, an integral controller is enough"
+        )
 
 
 def odds_of_response(problem: Problem, state: Trial) -> float:

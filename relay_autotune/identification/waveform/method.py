@@ -32,11 +32,11 @@ from relay_autotune.identification.waveform.choice import (
     ANSWERED,
     SIMPLE,
     TRIED,
+    NoResponseError,
     ahead_of_command,
     chosen_fit,
     mean_square_left,
     names_near,
-    no_response,
     odds_of_response,
 )
 from relay_autotune.identification.waveform.findings import report
@@ -184,7 +184,7 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
         try:
             fit = _by_noise(samples, chosen(samples), chosen)
             fit = _spared_of_outliers(samples, fit, known, chosen)
-        except IdentificationError:
+        except NoResponseError:
             return -math.inf, None
         return odds_of_response(fit.problem, fit.state), fit
 
@@ -198,7 +198,7 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
         if likelier > odds + ANSWERED:
             odds, fit = likelier, other
     if fit is None or odds <= ANSWERED:
-        raise no_response(known)
+        raise NoResponseError(known)
     if not held and (ahead := ahead_of_command(fit.problem, fit.state)):
         raise IdentificationError(
             f"the measurement moves {digits(ahead, 2)} s before the recorded command, which is "
@@ -267,7 +267,7 @@ def _is_stop(problem: Problem, begin: int, before: Fit, chosen: Choose) -> bool:
     """
     try:
         fits = before, chosen(problem.thinned(_FEW), SIMPLE)
-    except IdentificationError:
+    except NoResponseError:
         return True
     if fits[1].problem.load is not None:
         # A load that comes just there is no process that goes on.
