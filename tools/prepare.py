@@ -126,11 +126,13 @@ def prepare_oldest() -> None:
         shutil.rmtree(VENV_OLDEST, ignore_errors=True)
         say(f"numpy 1.26 is older than Python {platform.python_version()}: its tests are skipped")
         return
-    stamp = digest([REQUIREMENTS / "noble.txt", REQUIREMENTS / "tools.txt"], base_python())
+    pinned = [REQUIREMENTS / name for name in ("noble.txt", "run.txt", "tools.txt")]
+    stamp = digest(pinned, base_python())
     if not is_current(VENV_OLDEST, stamp):
-        pins = (REQUIREMENTS / "tools.txt").read_text()
-        testers = re.findall(r"^(?:pytest|hypothesis)==.*$", pins, re.MULTILINE)
-        make_venv(VENV_OLDEST, ["noble.txt"], "with the oldest numeric libraries", testers)
+        pins = "\n".join(path.read_text() for path in pinned)
+        # What reads recordings, and what tests.
+        others = re.findall(r"^(?:mcap|pytest|hypothesis)==.*$", pins, re.MULTILINE)
+        make_venv(VENV_OLDEST, ["noble.txt"], "with the oldest numeric libraries", others)
         mark(VENV_OLDEST, stamp)
 
 
