@@ -123,8 +123,8 @@ class NoResponseError(IdentificationError):
         super().__init__(
             "the measurement shows no response to the command beyond its noise and a slow "
             "disturbance: record from a rest on, raise the amplitude, move the command more "
-            "often, and check that both topics belong to one "
-            f"loop{may if known.structure else ''}"
+            "often, leave out parts in which something else acts, and check that both topics "
+            f"belong to one loop{may if known.structure else ''}"
         )
 
 
