@@ -12,6 +12,7 @@ from scipy.integrate import odeint
 from relay_autotune import Known
 from relay_autotune.control.controller import PidController
 from relay_autotune.identification.methods import identify
+from relay_autotune.identification.waveform.problem import middle_of
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import SOPDT, UNSTABLE_FOPDT
@@ -134,3 +135,12 @@ def test_effects_are_told_apart_where_there_are_levels_on_both_sides():
     found = identify(Record(time, y, u(time)), known=Known(structure="fopdt"))
     assert found.middle == pytest.approx(1.2, abs=0.1)
     assert found.model.gain == pytest.approx(4.0 * (1.0 - 0.2 * found.middle), rel=0.03)
+
+
+def test_a_level_that_is_held_for_long_counts_as_many_short_ones():
+    """One level of thirty is below the first one, and is held as long as ten others."""
+    levels = np.append(1.0 + np.arange(29) % 2, -1.0)
+    u = PiecewiseConstant(np.append(20.0 * np.arange(1, 30), 1000.0), levels, 0.0)
+    assert middle_of(u) == 0.5
+    held = PiecewiseConstant(np.append(u.times, 1200.0), np.append(levels, 0.0), 0.0)
+    assert middle_of(held) == 0.0

@@ -32,7 +32,7 @@ _INSTANTS = 60
 # Least play, friction or shift of an end that counts, as a share of the command's range: the steps
 # of a sensor look like a tenth.
 _LEAST = 0.01
-# Share of a command's levels that tell nothing of the effect on their side.
+# Share of the time on one side of a command that tells nothing of the effect there.
 _ONE_SIDE = 0.05
 
 
@@ -420,12 +420,17 @@ def is_above(u: Input, level: float) -> PiecewiseConstant:
 def middle_of(u: Input) -> float:
     """Return the command above and below which effects may differ [u].
 
-    It is the first one, or half the range where nearly all levels are on one side of that.
+    It is the first one, or half the range where the command is hardly ever on one side of that.
     """
     assert isinstance(u, PiecewiseConstant)
-    low, high = np.quantile(u.levels, (_ONE_SIDE, 1.0 - _ONE_SIDE))
-    middle = 0.5 * (float(u.levels.min()) + float(u.levels.max()))
-    return u.initial if low < u.initial < high else middle
+    # How long the first and the last level last is not part of the command.
+    gaps = np.diff(u.times)
+    typical = float(gaps.mean()) if gaps.size else 1.0
+    lasting = np.array([typical, *gaps, typical])
+    seldom = min(lasting[u.levels < u.initial].sum(), lasting[u.levels > u.initial].sum())
+    if seldom >= _ONE_SIDE * lasting.sum():
+        return u.initial
+    return 0.5 * (float(u.levels.min()) + float(u.levels.max()))
 
 
 def distance(u: Input, level: float) -> PiecewiseConstant:
