@@ -234,8 +234,9 @@ def _before_stop(problem: Problem, chosen: Choose) -> tuple[Problem, str]:
             # A controller, or a further command, may have made it stay.
             continue
         earlier = (before.time < changes[-1]) & (u(before.time) == u(held)[0])
-        if np.any(np.abs(before.y[earlier] - problem.y[begin]) <= band):
-            # The same command held it there before: it comes to rest.
+        there = np.abs(before.y[earlier] - np.median(problem.y[begin:stop])) <= band
+        if 2 * np.count_nonzero(there) >= stop - begin:
+            # The same command held it there before, about as long: it comes to rest.
             continue
         try:
             # Any model that follows the record tells whether it moves on.
