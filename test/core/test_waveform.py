@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import replace
 
@@ -19,6 +20,7 @@ from sampled_relay import simulate_sampled_relay
 
 from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
+from relay_autotune.identification.waveform.choice import NoResponseError, chosen_fit
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.problem import problem_of
 from relay_autotune.identification.waveform.residuals import ljung_box
@@ -270,6 +272,15 @@ def test_a_response_within_one_sample_is_named(seed):
     command = np.repeat(rng.choice([0.0, 1.0, 2.0], 20), 20)
     with pytest.raises(IdentificationError, match=r"within one sample, 1\.0 s"):
         identify_waveform(Record(time, 3.0 * command + rng.normal(0.0, 0.05, 400), command))
+
+
+def test_a_response_between_samples_that_are_left_out_is_not_within_one():
+    time = np.arange(8000.0)
+    u = PiecewiseConstant(np.array([1000.0, 3000.0, 6000.0]), np.array([1.0, -1.0, 0.5]), 0.0)
+    y = response(TransferFunction.fopdt(1.0, 0.8, 0.5), time, u)
+    few = problem_of([(time, y, u)], TABLE["fopdt"]).thinned(500)
+    with contextlib.suppress(NoResponseError):
+        chosen_fit(few, Known(), 0, 1.0, held=False)
 
 
 def test_an_unknown_structure_is_refused():

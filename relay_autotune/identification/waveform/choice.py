@@ -213,7 +213,8 @@ def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candid
 def _require_dynamics(context: FitContext, found: Sequence[Candidate]) -> None:
     """Raise an error where a response within one sample explains most, and no candidate does."""
     problem, fopdt = context.problem, context.fopdt
-    if unit_steps(FOPDT, fopdt.theta)[-1] > problem.shortest:
+    thinned = float(np.median(np.diff(problem.index))) > 1.0
+    if thinned or unit_steps(FOPDT, fopdt.theta)[-1] > problem.shortest:
         return
     left, total = left_in_simulation(problem, fopdt.coefficients, fopdt.theta)
     if left < 0.5 * total and all(mean_square_left(c) > _WORSE * left**2 for c in found):
