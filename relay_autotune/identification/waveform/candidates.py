@@ -79,10 +79,6 @@ TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "ends", "fric
 _HIDDEN = frozenset(("drift", "relaxation", "past", "ends"))
 # Steps of a fit with a further term or in another colour, and how often a load and ends are moved.
 _STEPS, _MOVES = 15, 4
-# Ratio of a FOPDT's sum of squares to that of a richer structure, from which that is more than an
-# imitation of it.
-_RICHER = 1.01
-
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
 # zero of a slower inverse response as a drift.
 _LASTING = 2.0
@@ -326,9 +322,10 @@ class FitContext:
         return likeliest_ends(self.problem)
 
     def _out_of_a_wrong_minimum(self, problem: Problem, state: Trial) -> Trial:
-        """Return a fit with a further term, begun anew where a FOPDT explains as much.
+        """Return a fit with a further term, begun anew where a FOPDT explains more.
 
-        Without the term, a dead time or a lag may have stood for it.
+        Without the term, a dead time or a lag may have stood for it. A richer structure explains
+        all that a FOPDT does, or it is in another minimum.
 
         :param problem: what was fitted.
         :param state: its fit, from that without the term.
@@ -337,7 +334,7 @@ class FitContext:
         fopdt = self._fopdt_of(beside)
         if problem.structure == FOPDT:
             return min(state, fopdt, key=lambda s: s.cost)
-        if fopdt.cost >= _RICHER * state.cost:
+        if fopdt.cost >= state.cost:
             return state
         starts = self._starts(Guess.of(beside, fopdt), problem.structure)
         return min(state, best_of(problem, starts), key=lambda s: s.cost)
