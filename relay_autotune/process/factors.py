@@ -253,9 +253,16 @@ class Denominator:
         parts = zip(self.factors, self.split(theta), strict=True)
         return tuple(c for f, own in parts for c in f.constants(own) * (f.multiplicity + more))
 
-    def numerators(
-        self, theta: FloatArray, powers: Sequence[int], *, by_dead_time: bool = True
-    ) -> FloatArray:
+    def numerators(self, powers: Sequence[int]) -> FloatArray:
+        """Return those of ``s^k``: coefficients, lowest power first, shape (p, d).
+
+        :param powers: k of each basis response, p of them.
+        """
+        # The constants T of what grows stand for -f.
+        turned = sum(f.multiplicity for f in self.factors if f.unstable)
+        return (-1.0) ** turned * np.eye(max(powers) + 1)[list(powers)]
+
+    def with_slopes(self, theta: FloatArray, powers: Sequence[int]) -> FloatArray:
         r"""Return numerators over the extended denominator, for responses and derivatives.
 
         With Q the product of the factors ``f_j^{n_j}`` and R that of the ``f_j``, a basis
@@ -264,7 +271,6 @@ class Denominator:
 
         :param theta: shape (parameters,).
         :param powers: k of each basis response, p of them.
-        :param by_dead_time: False: without the derivatives by the dead time.
         :return: coefficients, lowest power first, shape (p (2 + parameters), d): all responses,
             then their derivatives by each parameter in turn, then by the dead time.
         """
@@ -277,8 +283,7 @@ class Denominator:
             for derivative in factor.derivatives(part):
                 change = _product([[-factor.multiplicity * c for c in derivative], others])
                 rows += [[0.0] * k + change for k in powers]
-        if by_dead_time:
-            rows += [[0.0] * (k + 1) + [-c for c in whole] for k in powers]
+        rows += [[0.0] * (k + 1) + [-c for c in whole] for k in powers]
         width = max(map(len, rows))
         return np.array([row + [0.0] * (width - len(row)) for row in rows])
 

@@ -169,10 +169,10 @@ def _groups(poles: list[complex], horizon: float) -> list[list[complex]]:
     return groups
 
 
-def _term_count(group: list[complex], centre: complex, horizon: float) -> int:
+def _term_count(nodes: Sequence[complex], centre: complex, horizon: float) -> int:
     """Return the number of terms after which the cluster's sum is exact to rounding."""
-    size = len(group)
-    radius = max(abs(e - centre) for e in group)
+    size = len(nodes)
+    radius = max(abs(e - centre) for e in nodes)
     decay = radius / abs(centre.real) if centre.real < 0.0 else math.inf
     reach = min(radius * horizon, 64.0)
     for extra in range(1, _MOST_TERMS - size):
@@ -183,22 +183,12 @@ def _term_count(group: list[complex], centre: complex, horizon: float) -> int:
     return _MOST_TERMS
 
 
-def _terms(nodes: list[complex], centre: complex, scale: float, count: int) -> Coordinates:
+def _terms(nodes: Sequence[complex], centre: complex, scale: float, count: int) -> Coordinates:
     offset = (np.diag(nodes) - centre * np.eye(len(nodes)) + np.eye(len(nodes), k=1)) / scale
     powers = [np.eye(len(nodes), dtype=offset.dtype)]
     for p in range(1, count):
         powers.append(powers[-1] @ offset / p)
     return np.array(powers)
-
-
-def _of_powers(nodes: Sequence[complex], degree: int) -> list[list[complex]]:
-    """Return the divided differences ``s^i[e_1, ..., e_k]`` for i < degree, one row for each."""
-    row = [1.0 + 0j] + [0j] * (len(nodes) - 1)
-    rows = [row]
-    for _ in range(1, degree):
-        row = [e * a + b for e, a, b in zip(nodes, row, [0j, *row[:-1]], strict=True)]
-        rows.append(row)
-    return rows
 
 
 def _of_inverse(nodes: Sequence[complex], others: Sequence[complex]) -> list[complex]:
@@ -212,13 +202,16 @@ def _of_inverse(nodes: Sequence[complex], others: Sequence[complex]) -> list[com
     return found
 
 
-def _of_inverses(nodes: Sequence[complex], others: Sequence[complex]) -> ComplexArray:
-    """Return the divided differences ``(1/prod (s - q))[e_j, ..., e_k]``, shape (n, n)."""
-    size = len(nodes)
-    equal = nodes.count(nodes[0]) == size
-    series = _of_inverse(nodes, others)
-    rows = (series[: size - j] if equal else _of_inverse(nodes[j:], others) for j in range(size))
-    return np.array([[0j] * j + row for j, row in enumerate(rows)])
+def _of_ratios(
+    nodes: Sequence[complex], others: Sequence[complex], degree: int
+) -> list[list[complex]]:
+    """Return ``(s^i/prod (s - q))[e_1, ..., e_k]`` for i < degree, one row for each."""
+    row = _of_inverse(nodes, others)
+    rows = [row]
+    for _ in range(1, degree):
+        row = [e * a + b for e, a, b in zip(nodes, row, [0j, *row[:-1]], strict=True)]
+        rows.append(row)
+    return rows
 
 
 class Modes:
@@ -246,36 +239,34 @@ class Modes:
             raise ModelError("a process has at least as many poles as zeros")
         lead = math.prod((complex(t) for t in constants), start=1.0 + 0j)
         groups = _groups(poles, horizon)
+        upper = [_is_upper(group) for group in groups]
         every: list[complex] = []
+        for group, paired in zip(groups, upper, strict=True):
+            every += [e for pole in group for e in (pole, pole.conjugate())] if paired else group
+        taken: list[list[complex]] = [[] for _ in range(numerators.shape[1])]
         for group in groups:
-            pairs = [e for pole in group for e in (pole, pole.conjugate())]
-            every += pairs if _is_upper(group) else group
-        self._clusters: list[_Cluster] = []
-        first = 0
-        for group in groups:
-            upper = _is_upper(group)
-            equal = group.count(group[0]) == len(group)
-            centre = group[0] if equal else sum(group) / len(group)
             others = list(every)
             for e in group:
                 others.remove(e)
-            size = len(group)
-            degree = numerators.shape[1]
-            rows = numerators @ np.array(_of_powers(group, degree)) @ _of_inverses(group, others)
-            rows = rows / lead
-            real = not any(e.imag for e in group)
-            count = 0 if equal else _term_count(group, centre, horizon)
-            scale = abs(centre) or 1.0
-            terms = None if equal else _terms(group, centre, scale, count)
-            nodes: tuple[complex, ...] = tuple(group)
-            if real:
-                nodes = tuple(e.real for e in group)
-                rows, centre = np.ascontiguousarray(rows.real), centre.real
-                terms = None if terms is None else np.ascontiguousarray(terms.real)
-            place = slice(first, first + size)
-            share = 2.0 if upper else 1.0
-            self._clusters.append(_Cluster(nodes, centre, place, share, terms, scale, rows))
+            for row, more in zip(taken, _of_ratios(group, others, len(taken)), strict=True):
+                row += more
+        every_row = numerators @ (np.array(taken) / lead)
+        self._clusters: list[_Cluster] = []
+        first = 0
+        for group, paired in zip(groups, upper, strict=True):
+            place = slice(first, first + len(group))
             first = place.stop
+            nodes: tuple[Any, ...] = tuple(group)
+            rows, terms, scale = every_row[:, place], None, 1.0
+            if not any(e.imag for e in group):
+                nodes, rows = tuple(e.real for e in group), rows.real
+            centre = nodes[0]
+            if group.count(group[0]) < len(group):
+                centre = sum(nodes) / len(nodes)
+                scale = abs(centre) or 1.0
+                terms = _terms(nodes, centre, scale, _term_count(nodes, centre, horizon))
+            share = 2.0 if paired else 1.0
+            self._clusters.append(_Cluster(nodes, centre, place, share, terms, scale, rows))
         self._shares = np.concatenate([c.shares for c in self._clusters], axis=1)
         self.size = first
         self.input_direction = np.zeros(first)

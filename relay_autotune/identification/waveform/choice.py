@@ -278,7 +278,7 @@ def _odds(problem: Problem, theta: FloatArray, colour: Colour | None) -> float:
     :param colour: in which it was fitted.
     """
     alone, own = _likeliest(problem, problem.nuisances(theta), None)
-    rows = problem.seen(problem.columns(theta)[0])
+    rows = problem.seen(problem.columns(theta))
     answered = min(_likeliest(problem, rows, c)[0] for c in (colour, own))
     return alone - answered - theta.size * math.log(problem.time.size)
 

@@ -143,7 +143,7 @@ def _levelled(fit: Fit) -> Fit:
     if problem.colour is None:
         return fit
     lines = len(problem.bounds) * (1 + problem.drift)
-    columns, _ = problem.columns(state.theta)
+    columns = problem.columns(state.theta)
     rows, left = columns[-lines:], problem.y - state.coefficients @ columns
     coefficients = state.coefficients.copy()
     coefficients[-lines:] += np.linalg.lstsq(rows.T, left, rcond=None)[0]
@@ -191,7 +191,7 @@ def _fitted(records: Sequence[Record], fit: Fit, residual: FloatArray) -> FloatA
             weight=None,
             colour=None,
         )
-        columns, _ = every.columns(fit.state.theta)
+        columns = every.columns(fit.state.theta)
         fitted = record.measurement[0] + scale * (fit.state.coefficients @ columns)
         step = int(np.max(np.diff(problem.index), initial=1))
         # What comes after the last of those is left out.

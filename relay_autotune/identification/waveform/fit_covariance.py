@@ -56,7 +56,7 @@ class Fit:
 
 def raw_residual(problem: Problem, state: Trial) -> FloatArray:
     """Return the residual of a fit, neither weighted nor whitened, shape (n,)."""
-    columns, _ = problem.columns(state.theta)
+    columns = problem.columns(state.theta)
     return np.asarray(problem.y - state.coefficients @ columns)
 
 
@@ -141,7 +141,7 @@ def _scores(problem: Problem, state: Trial, fit: Fit) -> tuple[FloatArray, Float
     """Return Jacobian, derivative of the loss at each sample, and mean of its second one."""
     if fit.loss == "squares" or fit.base is None:
         return np.concatenate((state.columns, state.derivative)), state.residual, 1.0
-    columns, derivatives = problem.columns(state.theta)
+    columns, derivatives = problem.with_slopes(state.theta)
     derivative = np.einsum("k,mkn->mn", state.coefficients[: derivatives.shape[1]], derivatives)
     residual = fit.base * (problem.y - state.coefficients @ columns)
     scale = max(scale_of(residual), NEGLIGIBLE)

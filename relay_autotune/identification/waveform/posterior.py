@@ -176,7 +176,7 @@ def _draws(
     degrees = max(problem.time.size - state.parameters, 1)
     # As much as all samples tell, of fewer of them, without the noise of just these.
     variance = inflation * state.cost / degrees * few.time.size / problem.time.size
-    exact = replace(few, y=state.coefficients @ few.columns(state.theta)[0])
+    exact = replace(few, y=state.coefficients @ few.columns(state.theta))
     gain = state.coefficients[: len(problem.structure.powers)]
     return _allowed(exact, gain, state.theta, scale, lambda _: variance, count, rng)
 
@@ -515,7 +515,7 @@ def _slopes(problem: Problem, gain: FloatArray, theta: FloatArray) -> FloatArray
     :param gain: coefficients of the numerator, shape (k,).
     :param theta: shape (m,).
     """
-    columns, derivatives = problem.columns(theta)
+    columns, derivatives = problem.with_slopes(theta)
     k = gain.size
     left = problem.y - gain @ columns[:k]
     rows = problem.seen(np.concatenate((left[None, :], columns[k:])))

@@ -251,15 +251,25 @@ class Problem:
             found[part] = self.time[part][0]
         return found
 
-    def columns(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def columns(self, theta: FloatArray) -> FloatArray:
+        """Return the linear coefficients' columns, shape (k, n).
+
+        :param theta: shape (m,).
+        """
+        return self.with_slopes(theta, slopes=False)[0]
+
+    def with_slopes(
+        self, theta: FloatArray, *, slopes: bool = True
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the linear coefficients' columns, and the derivatives of the first l by theta.
 
         :param theta: shape (m,).
+        :param slopes: False: without derivatives, m = 0.
         :return: shapes (k, n) and (m, l, n); the k - l columns that theta does not change come
             last.
         """
         parts = self.experiments
-        found = [self._of_one(theta, part, i) for i, part in enumerate(parts)]
+        found = [self._of_one(theta, part, i, slopes=slopes) for i, part in enumerate(parts)]
         if len(parts) == 1:
             (columns, by_theta, rest) = found[0]
             return np.concatenate((columns, rest)), by_theta
@@ -267,7 +277,7 @@ class Problem:
         own_rows = sum(columns.shape[0] - k for columns, _, _ in found)
         last = k + own_rows
         every = np.zeros((last + sum(rest.shape[0] for _, _, rest in found), n))
-        derivatives = np.zeros((theta.size, last, n))
+        derivatives = np.zeros((theta.size if slopes else 0, last, n))
         first = k
         for part, (columns, by_theta, rest) in zip(parts, found, strict=True):
             # The responses are common to all experiments, the other columns their own.
@@ -284,24 +294,28 @@ class Problem:
         :param theta: shape (m,).
         """
         beside = replace(self, unequal=False, play=False, ends=None)
-        return self.seen(beside.columns(theta)[0][len(self.structure.powers) :])
+        return self.seen(beside.columns(theta)[len(self.structure.powers) :])
 
     def _of_one(
-        self, theta: FloatArray, part: slice, number: int
+        self, theta: FloatArray, part: slice, number: int, *, slopes: bool
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return one experiment's columns with their derivatives, and its straight line."""
-        time = self.time[part]
-        first, *further = columns_of(self.structure, theta, time, self.delayed[number])
+        time, structure = self.time[part], self.structure
+        first, *further = columns_of(structure, theta, time, self.delayed[number], slopes=slopes)
         blocks = [first]
-        if self.relaxation or self.structure.unstable:
+        if self.relaxation or structure.unstable:
             growing_only = not self.relaxation
             blocks.append(
-                free_motion(self.structure.denominator, theta, time, growing_only=growing_only)
+                free_motion(
+                    structure.denominator, theta, time, growing_only=growing_only, slopes=slopes
+                )
             )
         if self.friction:
             at_once = np.append(theta[:-1], 0.0)
-            for columns, by_theta in columns_of(self.structure, at_once, time, self.motions):
-                by_theta[-1] = 0.0
+            for columns, by_theta in columns_of(
+                structure, at_once, time, self.motions, slopes=slopes
+            ):
+                by_theta[-1:] = 0.0
                 blocks.append((columns, by_theta))
         blocks += further
         rest = self.line(time)

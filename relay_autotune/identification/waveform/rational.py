@@ -26,7 +26,12 @@ _LOG_RANGE = 30.0
 
 
 def columns_of(
-    structure: Structure, theta: FloatArray, time: FloatArray, inputs: Sequence[Input]
+    structure: Structure,
+    theta: FloatArray,
+    time: FloatArray,
+    inputs: Sequence[Input],
+    *,
+    slopes: bool = True,
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Return a structure's responses to each input, shape (k, n), and derivatives, (m, k, n).
 
@@ -34,11 +39,15 @@ def columns_of(
     :param theta: shape (m,).
     :param time: sample times [s], shape (n,).
     :param inputs: the deviation of each from its ``initial`` acts.
+    :param slopes: False: without derivatives, shape (0, k, n).
     """
     held = [u for u in inputs if isinstance(u, PiecewiseConstant)]
     if structure == FOPDT and len(held) == len(inputs):
-        return [one_lag(theta, time, u) for u in held]
-    return responses(structure.denominator, structure.powers, theta, time, inputs)
+        every = (one_lag(theta, time, u) for u in held)
+        return [(found, changes if slopes else changes[:0]) for found, changes in every]
+    return responses(
+        structure.denominator, structure.powers, theta, time, inputs, slopes=slopes
+    )
 
 
 def unit_steps(structure: Structure, theta: FloatArray, least: float = 0.0) -> FloatArray:
@@ -134,6 +143,8 @@ def _at_changes(levels: FloatArray, gaps: FloatArray) -> tuple[FloatArray, Float
 
 
 _CHUNK = 1 << 15
+# ``q t^2`` below which a series has more digits than a difference.
+_LITTLE_TURN = 1e-4
 
 
 def responses(
@@ -142,6 +153,8 @@ def responses(
     theta: FloatArray,
     time: FloatArray,
     inputs: Sequence[Input],
+    *,
+    slopes: bool = True,
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Return the responses of ``s^k exp(-D s)/(s^m Q)`` to each input, and their derivatives.
 
@@ -154,13 +167,17 @@ def responses(
     :param time: sample times, not decreasing [s], shape (n,).
     :param inputs: the deviation of each from its ``initial`` acts, of ramps as exactly as of
         steps; only the first one may be of ramps.
-    :return: of each input shapes (p, n) and (len(theta), p, n).
+    :param slopes: False: without derivatives.
+    :return: of each input shapes (p, n) and (len(theta), p, n), or (0, p, n).
     """
     own, dead_time = theta[:-1], float(theta[-1])
     ramps = isinstance(inputs[0], PiecewiseLinear)
     if ramps and len(inputs) > 1:
-        alone = responses(denominator, powers, theta, time, inputs[:1])
-        return alone + responses(denominator, powers, theta, time, inputs[1:])
+        both = inputs[:1], inputs[1:]
+        alone, others = (
+            responses(denominator, powers, theta, time, some, slopes=slopes) for some in both
+        )
+        return alone + others
     at = np.unique(np.concatenate([u.times for u in inputs]))
     steps = np.zeros((len(inputs), at.size))
     for row, u in zip(steps, inputs, strict=True):
@@ -173,30 +190,36 @@ def responses(
         first, last = min(time[0], changes[0]) - 1.0, max(time[-1], changes[-1]) + 1e-9
         changes = np.concatenate(([first], changes, [last]))
         steps = np.pad(steps, ((0, 0), (1, 1)))
-    numerators = denominator.numerators(own, powers)
-    values = _follow(
-        denominator, own, numerators, time, changes, steps, backward=unstable, ramps=ramps
-    )
-    p, shape = len(powers), (theta.size, len(powers), time.size)
+    rows = denominator.with_slopes(own, powers) if slopes else denominator.numerators(powers)
+    constants = denominator.constants(own, int(slopes))
+    integrators = denominator.integrators + ramps
+    values = _follow(constants, integrators, rows, time, changes, steps, backward=unstable)
+    p, shape = len(powers), (-1, len(powers), time.size)
     return [(values[:p, i], values[p:, i].reshape(shape)) for i in range(len(inputs))]
 
 
 def free_motion(
-    denominator: Denominator, theta: FloatArray, time: FloatArray, *, growing_only: bool = False
+    denominator: Denominator,
+    theta: FloatArray,
+    time: FloatArray,
+    *,
+    growing_only: bool = False,
+    slopes: bool = True,
 ) -> tuple[FloatArray, FloatArray]:
     """Return what a free initial state adds to the output, and its derivatives.
 
-    Stable poles: the responses of ``s^j/Q``, j < order, to an impulse at the first sample. An
-    unstable lag: ``exp((t - t_end)/tau)``. The free state of an integrator is the offset, which
-    is a column of the fit anyway.
+    A lag to the power n: ``x^j exp(-x)``, j < n, of the time x since the first sample over tau. An
+    unstable one: ``exp((t - t_end)/tau)``. The free state of an integrator is the offset, which is
+    a column of the fit anyway.
 
     :param denominator: the structure's denominator.
     :param theta: its parameters, then D [s].
     :param time: sample times, not decreasing [s], shape (n,).
     :param growing_only: True: of the poles in the right half plane alone.
-    :return: shapes (q, n) and (len(theta), q, n).
+    :param slopes: False: without derivatives.
+    :return: shapes (q, n) and (len(theta), q, n), or (0, q, n).
     """
-    columns, derivatives = [], []
+    columns, derivatives = [np.zeros((0, time.size))], []
     own = denominator.split(theta[:-1])
     first = 0
     for factor, part in zip(denominator.factors, own, strict=True):
@@ -204,41 +227,68 @@ def free_motion(
         first = place.stop
         if growing_only and not factor.unstable:
             continue
-        if factor.unstable:
-            x = (time - time[-1]) / np.exp(part[0])
-            found, changes = np.exp(x)[None, :], (-x * np.exp(x))[None, None, :]
+        if isinstance(factor, Quadratic):
+            found, changes = _free_pair(part, time)
         else:
-            single = Denominator((factor,))
-            # An impulse is the derivative of a step: one power of s higher.
-            powers = tuple(range(1, single.order + 1))
-            numerators = single.numerators(part, powers, by_dead_time=False)
-            values = _follow(single, part, numerators, time, time[:1], np.ones((1, 1)))[:, 0]
-            found = values[: single.order]
-            changes = values[single.order :].reshape(-1, *found.shape)
-        all_changes = np.zeros((theta.size, *found.shape))
-        all_changes[place] = changes
+            # The time by which it has decayed.
+            x = (time[-1] - time if factor.unstable else time - time[0]) / np.exp(part[0])
+            j = np.arange(factor.multiplicity)[:, None]
+            found = x**j * np.exp(-x)
+            # Of n columns the derivative of the last one has a power more.
+            changes = ((x - j) * found)[None]
+        if slopes:
+            all_changes = np.zeros((theta.size, *found.shape))
+            all_changes[place] = changes
+            derivatives.append(all_changes)
         columns.append(found)
-        derivatives.append(all_changes)
-    if not columns:
-        return np.zeros((0, time.size)), np.zeros((theta.size, 0, time.size))
-    return np.concatenate(columns), np.concatenate(derivatives, axis=1)
+    every = np.concatenate(columns)
+    if not derivatives:
+        return every, np.zeros((theta.size if slopes else 0, *every.shape))
+    return every, np.concatenate(derivatives, axis=1)
+
+
+def _free_pair(theta: FloatArray, time: FloatArray) -> tuple[FloatArray, FloatArray]:
+    r"""Return the free motions of a quadratic factor, shape (2, n), and derivatives, (2, 2, n).
+
+    With a = zeta w0 and q = w0^2 (zeta^2 - 1) they are ``c = exp(-a t) cosh(sqrt(q) t)`` and
+    ``s = exp(-a t) sinh(sqrt(q) t)/sqrt(q)``, with the derivatives by a ``-t c`` and ``-t s`` and
+    by q ``t s/2`` and ``(t c - s)/(2 q)``, all of them smooth where q changes its sign.
+
+    :param theta: (log(1/w0), log zeta).
+    :param time: sample times [s], shape (n,).
+    """
+    frequency, zeta = math.exp(-theta[0]), math.exp(theta[1])
+    t, a, q = time - time[0], zeta * frequency, frequency**2 * (zeta * zeta - 1.0)
+    root = math.sqrt(abs(q))
+    if q > 0.0:
+        slow = np.exp(-(frequency**2) / (a + root) * t)
+        fast = np.expm1(-2.0 * root * t)
+        c, s = slow * (1.0 + 0.5 * fast), slow * fast / (-2.0 * root)
+    else:
+        decay = np.exp(-a * t)
+        c, s = decay * np.cos(root * t), decay * t * np.sinc(root / math.pi * t)
+    turn, x = t * c - s, q * t * t
+    # Where the difference is all rounding, its series.
+    few = np.abs(x) < _LITTLE_TURN
+    by_q = np.where(few, np.exp(-a * t) * t**3 * (1.0 / 3.0 + x / 30.0), turn / (q or 1.0))
+    by_time = (a * t * c - q * t * s, a * t * s - turn)
+    by_damping = (a * t * (a * s - c), a * (a * by_q - t * s))
+    return np.stack((c, s)), np.stack((by_time, by_damping))
 
 
 def _follow(
-    denominator: Denominator,
-    own: FloatArray,
+    constants: Sequence[complex],
+    integrators: int,
     numerators: FloatArray,
     time: FloatArray,
     changes: FloatArray,
     steps: FloatArray,
     *,
     backward: bool = False,
-    ramps: bool = False,
 ) -> FloatArray:
     """Return the outputs at the samples, zero before the first change, (outputs, inputs, n)."""
     horizon = max(float(max(time[-1], changes[-1]) - changes[0]), np.finfo(float).tiny)
-    constants = denominator.constants(own, 1)
-    modes = Modes(constants, denominator.integrators + ramps, numerators, horizon)
+    modes = Modes(constants, integrators, numerators, horizon)
     states = modes.states(changes, steps, backward=backward)
     segment = changes.searchsorted(time, side="right") - 1
     values = np.zeros((numerators.shape[0], steps.shape[0], time.size))

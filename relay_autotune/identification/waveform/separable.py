@@ -70,7 +70,7 @@ def evaluate(problem: Problem, theta: FloatArray) -> Trial:
     :param problem: the problem.
     :param theta: shape (m,).
     """
-    columns, derivatives = problem.columns(theta)
+    columns, derivatives = problem.with_slopes(theta)
     y, columns = problem.seen(problem.y), problem.seen(columns)
     size = np.sqrt(np.einsum("kn,kn->k", columns, columns))
     size[size == 0.0] = 1.0
@@ -101,7 +101,7 @@ def left_by(problem: Problem, gain: FloatArray, theta: FloatArray) -> FloatArray
     :param gain: coefficients of the numerator, shape (k,).
     :param theta: shape (m,).
     """
-    columns, _ = problem.columns(theta)
+    columns = problem.columns(theta)
     left = problem.y - gain @ columns[: gain.size]
     first, *beside = problem.seen(np.concatenate((left[None, :], columns[gain.size :])))
     return left_of(first, np.array(beside))

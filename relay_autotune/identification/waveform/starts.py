@@ -329,7 +329,7 @@ def _costs(
         )
         fixed = problem.line(time)
         if problem.relaxation:
-            free, _ = free_motion(problem.structure.denominator, theta, time)
+            free, _ = free_motion(problem.structure.denominator, theta, time, slopes=False)
             fixed = np.concatenate((fixed, free))
         rows = np.stack(
             [np.broadcast_to(row, moved.shape) for row in (y, response, *fixed, *shifted)]
@@ -418,7 +418,7 @@ def shifted_columns(
     :return: shape (k, rows, n).
     """
     order = np.argsort(moved, axis=None, kind="stable")
-    columns = columns_of(structure, theta, moved.ravel()[order], (u,))[0][0]
+    columns, _ = columns_of(structure, theta, moved.ravel()[order], (u,), slopes=False)[0]
     found = np.empty_like(columns)
     found[:, order] = columns
     return found.reshape(-1, *moved.shape)
