@@ -79,6 +79,8 @@ TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "ends", "fric
 _HIDDEN = frozenset(("drift", "relaxation", "past", "ends"))
 # Steps of a fit with a further term or in another colour, and how often a load and ends are moved.
 _STEPS, _MOVES = 15, 4
+# Gain in a score that changes no choice.
+LITTLE = 0.5
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
 # zero of a slower inverse response as a drift.
 _LASTING = 2.0
@@ -325,16 +327,17 @@ class FitContext:
         """Return a fit with a further term, begun anew where a FOPDT explains more.
 
         Without the term, a dead time or a lag may have stood for it. A richer structure explains
-        all that a FOPDT does, or it is in another minimum.
+        all that a FOPDT does, but for a little, or it is in another minimum.
 
         :param problem: what was fitted.
         :param state: its fit, from that without the term.
         """
-        beside = replace(problem, structure=FOPDT)
+        beside, n = replace(problem, structure=FOPDT), problem.time.size
         fopdt = self._fopdt_of(beside)
         if problem.structure == FOPDT:
             return min(state, fopdt, key=lambda s: s.cost)
-        if fopdt.cost >= state.cost:
+        own, plain = (information_criterion(s.cost, n, 0, self.floor) for s in (state, fopdt))
+        if own - plain <= LITTLE:
             return state
         starts = self._starts(Guess.of(beside, fopdt), problem.structure)
         return min(state, best_of(problem, starts), key=lambda s: s.cost)

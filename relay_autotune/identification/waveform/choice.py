@@ -24,6 +24,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.candidates import (
+    LITTLE,
     Candidate,
     FitContext,
     as_in,
@@ -88,8 +89,8 @@ _A_CURVE, _RESPONSES = 20.0, 3.0
 # In white noise every sample tells something; more than these change no choice.
 _MOST_WHITE = 16_384
 _MOST_TIMES = 4
-# Turns between a colour and what it leaves, and the gain in the score that ends them.
-_MOST_TURNS, _LITTLE = 20, 0.5
+# Turns between a colour and what it leaves.
+_MOST_TURNS = 20
 # Probability of white noise as correlated as a residual, from which that counts as white.
 _CHANCE = 1e-3
 # Score beyond which a structure is hopeless beside the best one: odds of e^15. The plain ones
@@ -302,7 +303,7 @@ def _likeliest(
         left = seen - factors @ by
         score = information_criterion(float(left @ left), n, rows.shape[0], floor)
         score += colour_cost(colour, n)
-        if score > best[0] - _LITTLE:
+        if score > best[0] - LITTLE:
             break
         best = score, colour
         left = y - factors @ rows
