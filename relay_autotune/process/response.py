@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dtbtrs, ztbtrs
 
-from relay_autotune.arrays import ComplexArray, FloatArray
+from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import PiecewiseConstant
@@ -257,7 +257,8 @@ class Modes:
             place = slice(first, first + len(group))
             first = place.stop
             nodes: tuple[Any, ...] = tuple(group)
-            rows, terms, scale = every_row[:, place], None, 1.0
+            rows: Coordinates = every_row[:, place]
+            terms, scale = None, 1.0
             if not any(e.imag for e in group):
                 nodes, rows = tuple(e.real for e in group), rows.real
             centre = nodes[0]

@@ -45,9 +45,7 @@ def columns_of(
     if structure == FOPDT and len(held) == len(inputs):
         every = (one_lag(theta, time, u) for u in held)
         return [(found, changes if slopes else changes[:0]) for found, changes in every]
-    return responses(
-        structure.denominator, structure.powers, theta, time, inputs, slopes=slopes
-    )
+    return responses(structure.denominator, structure.powers, theta, time, inputs, slopes=slopes)
 
 
 def unit_steps(structure: Structure, theta: FloatArray, least: float = 0.0) -> FloatArray:
@@ -219,7 +217,8 @@ def free_motion(
     :param slopes: False: without derivatives.
     :return: shapes (q, n) and (len(theta), q, n), or (0, q, n).
     """
-    columns, derivatives = [np.zeros((0, time.size))], []
+    columns: list[FloatArray] = [np.zeros((0, time.size))]
+    derivatives: list[FloatArray] = []
     own = denominator.split(theta[:-1])
     first = 0
     for factor, part in zip(denominator.factors, own, strict=True):
