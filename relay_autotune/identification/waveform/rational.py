@@ -217,11 +217,10 @@ def free_motion(
     :param slopes: False: without derivatives.
     :return: shapes (q, n) and (len(theta), q, n), or (0, q, n).
     """
+    size, first = theta.size if slopes else 0, 0
     columns: list[FloatArray] = [np.zeros((0, time.size))]
-    derivatives: list[FloatArray] = []
-    own = denominator.split(theta[:-1])
-    first = 0
-    for factor, part in zip(denominator.factors, own, strict=True):
+    derivatives: list[FloatArray] = [np.zeros((size, 0, time.size))]
+    for factor, part in zip(denominator.factors, denominator.split(theta[:-1]), strict=True):
         place = slice(first, first + len(factor.parameters))
         first = place.stop
         if growing_only and not factor.unstable:
@@ -235,15 +234,10 @@ def free_motion(
             found = x**j * np.exp(-x)
             # Of n columns the derivative of the last one has a power more.
             changes = ((x - j) * found)[None]
-        if slopes:
-            all_changes = np.zeros((theta.size, *found.shape))
-            all_changes[place] = changes
-            derivatives.append(all_changes)
         columns.append(found)
-    every = np.concatenate(columns)
-    if not derivatives:
-        return every, np.zeros((theta.size if slopes else 0, *every.shape))
-    return every, np.concatenate(derivatives, axis=1)
+        derivatives.append(np.zeros((size, *found.shape)))
+        derivatives[-1][place] = changes[:size]
+    return np.concatenate(columns), np.concatenate(derivatives, axis=1)
 
 
 def _free_pair(theta: FloatArray, time: FloatArray) -> tuple[FloatArray, FloatArray]:
