@@ -81,6 +81,33 @@ def test_derivatives_are_the_limits_of_differences(name):
             assert error.max() < 1e-5 * (1.0 + np.abs(free_derivatives[i]).max())
 
 
+@pytest.mark.parametrize("name", DENOMINATORS)
+def test_without_slopes_the_responses_are_the_same(name):
+    denominator, powers, point = DENOMINATORS[name]
+    theta = np.array(point)
+    ((found, _),) = responses(denominator, powers, theta, TIME, (INPUT,))
+    ((alone, none),) = responses(denominator, powers, theta, TIME, (INPUT,), slopes=False)
+    np.testing.assert_allclose(alone, found, atol=1e-9 * np.abs(found).max())
+    assert none.shape == (0, *found.shape)
+    (found, _), (alone, none) = (free_motion(denominator, theta, TIME, slopes=s) for s in (1, 0))
+    np.testing.assert_array_equal(alone, found)
+    assert none.shape == (0, *found.shape)
+
+
+@pytest.mark.parametrize(
+    "name", [n for n in DENOMINATORS if "unstable" not in n and "integrator" not in n]
+)
+def test_what_a_step_leaves_to_come_is_a_free_motion(name):
+    denominator, _, point = DENOMINATORS[name]
+    theta = np.array([*point[:-1], 0.0])
+    model = TransferFunction(1.0, (), denominator.constants(theta[:-1]), 0, 0.0)
+    to_come = 1.0 - response(model, TIME, PiecewiseConstant(TIME[:1], np.ones(1), 0.0))
+    columns, _ = free_motion(denominator, theta, TIME)
+    assert columns.shape[0] == denominator.order
+    left = to_come - np.linalg.lstsq(columns.T, to_come, rcond=None)[0] @ columns
+    assert np.abs(left).max() < 1e-9
+
+
 @pytest.mark.parametrize("name", [n for n in DENOMINATORS if "unstable" not in n])
 def test_responses_are_those_of_the_transfer_function(name):
     denominator, powers, point = DENOMINATORS[name]
