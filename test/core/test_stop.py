@@ -48,6 +48,19 @@ def test_what_lies_at_the_end_of_a_sensor_is_left_out():
     assert found.ultimate_gain == pytest.approx(ultimate_point(LAG).gain, rel=0.3)
 
 
+def test_what_comes_after_the_end_of_a_sensor_counts_where_the_command_moves_more_often():
+    time, rng = np.arange(0.0, 60.0, 0.05), np.random.default_rng(3)
+    later = np.arange(9.0, 60.0, 3.0)
+    levels = np.array([1.0, 0.0, *rng.uniform(0.0, 0.55, later.size)])
+    u = PiecewiseConstant(np.array([3.0, 6.0, *later]), levels, 0.0)
+    y = np.minimum(response(LAG, time, u), 6.0) + 0.05 * rng.standard_normal(time.size)
+    found = identify(Record(time, y, u(time)), known=Known(structure="fopdt"))
+    assert told_of_a_stop(found)
+    assert np.isnan(found.fitted[time < 6.0]).all()
+    assert np.isfinite(found.fitted[time > 7.0]).all()
+    assert found.ultimate_gain == pytest.approx(ultimate_point(LAG).gain, rel=0.1)
+
+
 @pytest.mark.parametrize(
     ("model", "changes", "levels"),
     [

@@ -194,8 +194,8 @@ def _fitted(records: Sequence[Record], fit: Fit, residual: FloatArray) -> FloatA
         columns = every.columns(fit.state.theta)
         fitted = record.measurement[0] + scale * (fit.state.coefficients @ columns)
         step = int(np.max(np.diff(problem.index), initial=1))
-        # What comes after the last of those is left out.
-        fitted[problem.index[-1] + step :] = math.nan
+        # What comes before the first and after the last of those is left out.
+        fitted[: problem.index[0]] = fitted[problem.index[-1] + step :] = math.nan
         return np.asarray(fitted)
     own = problem.index < len(record)
     used = problem.index[own]

@@ -178,7 +178,7 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
     stopped = ""
     if not sign and len(problem.bounds) == 1:
         # Under a relay it turns around.
-        problem, stopped = _before_stop(problem, chosen)
+        problem, stopped = _beside_stops(problem, chosen)
 
     def searched(samples: Problem) -> tuple[float, Fit | None]:
         try:
@@ -213,11 +213,12 @@ def _moves_often(time: FloatArray, u: Input) -> bool:
     return changes_within(u, time).size >= MANY and not is_controlled(time, u)
 
 
-def _before_stop(problem: Problem, chosen: Choose) -> tuple[Problem, str]:
-    """Return the samples before a stop or the end of a sensor's range, and what is to be told.
+def _beside_stops(problem: Problem, chosen: Choose) -> tuple[Problem, str]:
+    """Return the samples on one side of a stop or a sensor's end, and what is to be told.
 
     The measurement stays at an end of its range in mid-movement, and the model of what comes
-    before moves on: there the process does not answer, or it is not seen.
+    before moves on: there the process does not answer, or it is not seen. The side on which the
+    command moves more often tells more.
 
     :param problem: all samples.
     :param chosen: fits samples.
@@ -250,11 +251,15 @@ def _before_stop(problem: Problem, chosen: Choose) -> tuple[Problem, str]:
         if float(np.median(on[1:] - on[0])) / away > 1.0 and _is_stop(
             problem.part(slice(0, stop)), begin, fit, chosen
         ):
-            return before, (
+            after = problem.part(slice(stop, None))
+            told = (
                 f"from {problem.time[begin]:.4g} s on the measurement stays at an end of its "
                 "range, where the process would move on: a stop, or the sensor's end; it and all "
-                "after it were left out"
             )
+            if changes_within(u, after.time).size <= changes.size:
+                return before, f"{told}after it were left out"
+            after, more = _beside_stops(after, chosen)
+            return after, "; ".join(filter(None, (f"{told}before it were left out", more)))
     return problem, ""
 
 
