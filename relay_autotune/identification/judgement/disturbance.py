@@ -17,17 +17,21 @@ from relay_autotune.identification.result import Identification
 from relay_autotune.record.cycles import cycles_of
 from relay_autotune.record.record import Cycle, Record
 
-# Ratio of residuals beyond the noise below which the end of a record alone is better.
+# Ratio of residuals beyond the noise below which the end of a record alone is better, of the same
+# samples: other amplitudes than those of the end show what is not linear.
 _BETTER = 0.5
 
 # Number of last cycles that are kept.
 KEPT_CYCLES = 3
 
 
-def _unexplained(found: Identification, record: Record) -> float:
-    """Return a model's residual beyond the noise, as a root mean square [y]."""
+def _unexplained(found: Identification, record: Record, begin: int = 0) -> float:
+    """Return a model's residual beyond the noise from some sample on, as an rms [y]."""
     noise = 0.0 if math.isnan(record.noise_std) else record.noise_std
-    return math.sqrt(max(found.fit.residual_rms**2 - noise**2, 0.0))
+    square = found.fit.residual_rms**2
+    if begin and len(found.fitted) == len(record):
+        square = float(np.nanmean((record.measurement - found.fitted)[begin:] ** 2))
+    return math.sqrt(max(square - noise**2, 0.0))
 
 
 def last_cycles(record: Record, cycles: tuple[Cycle, ...]) -> Record | None:
@@ -62,15 +66,18 @@ def without_disturbance(
         found = identify(record)
         if misfit(found, record) <= 1.0:
             return found
-        most = _BETTER * _unexplained(found, record)
     except IdentificationError as error:
-        found, most = error, math.inf
+        found = error
     alone = _of_end(record, identify)
-    if alone is not None and _unexplained(alone, record) < most:
-        return alone
     if isinstance(found, IdentificationError):
-        raise found
-    return found
+        if alone is None:
+            raise found
+        return alone
+    if alone is None:
+        return found
+    begin = int(np.argmax(np.isfinite(alone.fitted))) if alone.fitted.size else 0
+    better = _unexplained(alone, record) < _BETTER * _unexplained(found, record, begin)
+    return alone if better else found
 
 
 def _of_end(record: Record, identify: Callable[[Record], Identification]) -> Identification | None:

@@ -227,27 +227,30 @@ class FitContext:
             return None
         if model.growth_in(1.0) > self.most_growth:
             return None
-        if min(problem.effects(state.coefficients)) < 0.0:
-            # Commands may lose their effect on one side, but not act the other way there.
-            return None
-        low, high = problem.ends_of(state.coefficients)
-        if not low < high:
-            return None
-        if (
-            problem.friction
-            and problem.dry_friction(state.coefficients) < self.problem.least_command
-        ):
-            return None
-        if problem.play and not (
-            self.problem.least_command
-            <= problem.play_of(state.coefficients)
-            <= problem.most_play(held=self.held)
-        ):
+        if self._impossible(problem, state):
             return None
         shortest, _ = time_scales(self.problem)
         if is_unobservable(model, shortest, self.length, self.pushed):
             return None
         return Candidate(problem, state, model, self._score(problem, state, model))
+
+    def _impossible(self, problem: Problem, state: Trial) -> list[str]:
+        """Return the terms beside a model of which its fit makes what cannot be, or what is none.
+
+        :param problem: what was fitted.
+        :param state: the fit.
+        """
+        found, least = state.coefficients, self.problem.least_command
+        low, high = problem.ends_of(found)
+        most = problem.most_play(held=self.held) if problem.play else 0.0
+        possible = {
+            # Commands may lose their effect on one side, but not act the other way there.
+            "unequal": min(problem.effects(found)) >= 0.0,
+            "ends": low < high,
+            "friction": not problem.friction or problem.dry_friction(found) >= least,
+            "play": not problem.play or least <= problem.play_of(found) <= most,
+        }
+        return [term for term, may_be in possible.items() if not may_be]
 
     def near(self, problem: Problem, state: Trial) -> Candidate | None:
         """Fit a problem from the fit of a similar one; None as for :meth:`candidate`.
@@ -315,8 +318,8 @@ class FitContext:
 
         :param candidate: in white noise.
         """
-        problem = replace(candidate.problem, load=None)
-        return self.with_terms(replace(candidate, problem=problem), ("load",))
+        candidate = replace(candidate, problem=without(candidate.problem, ["load"]))
+        return self.with_terms(candidate, ("load",))
 
     @cached_property
     def ends(self) -> tuple[float, float] | None:
@@ -412,9 +415,15 @@ class FitContext:
                 found.append(same[name])
                 continue
             for structure in self._family(name, order):
-                state = self._best_fit(structure, least)
+                problem = replace(self.problem, structure=structure)
+                if not structure.integrators:
+                    problem = without(problem, ["friction"])
+                state = self._best_fit(problem, least)
+                if state is not None and (none := self._impossible(problem, state)):
+                    # Another structure needed them.
+                    problem = without(problem, none)
+                    state = self._best_fit(problem, least)
                 if state is not None:
-                    problem = replace(self.problem, structure=structure)
                     least = min(least, max(state.cost, self.floor) / problem.time.size)
                     found.append(self.candidate(problem, state))
         return [c for c in found if c is not None]
@@ -454,14 +463,14 @@ class FitContext:
             if enough or structure.order <= 1:
                 yield structure
 
-    def _best_fit(self, structure: Structure, least: float) -> Trial | None:
+    def _best_fit(self, problem: Problem, least: float) -> Trial | None:
         """Return the best fit of a structure; None where it is hopeless beside the least one."""
-        if structure == FOPDT:
+        known = nuisances_of(problem) == nuisances_of(self.problem)
+        if known and problem.structure == FOPDT:
             return self.fopdt
-        problem = replace(self.problem, structure=structure)
-        if structure == UNSTABLE_FOPDT:
+        if known and problem.structure == UNSTABLE_FOPDT:
             return self.unstable
-        return multistart(problem, self._starts(self.guess, structure), least)
+        return multistart(problem, self._starts(self.guess, problem.structure), least)
 
 
 def _refined(problem: Problem, state: Trial) -> Trial:
@@ -486,6 +495,16 @@ def nuisances_of(problem: Problem, terms: Iterable[str] = TERMS) -> tuple[bool, 
     return tuple(
         getattr(problem, t) is not False and getattr(problem, t) is not None for t in terms
     )
+
+
+def without(problem: Problem, terms: Iterable[str]) -> Problem:
+    """Return a problem without some of the terms beside the model.
+
+    :param problem: any.
+    :param terms: some of ``TERMS``.
+    """
+    absent: dict[str, Any] = {t: None if t in ("load", "ends") else False for t in terms}
+    return replace(problem, **absent)
 
 
 def as_in(other: Problem, problem: Problem) -> Problem:

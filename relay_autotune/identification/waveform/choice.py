@@ -423,9 +423,8 @@ def _with_terms(
     :param decided: has the terms, in white noise.
     :param ready: fitted before, in white noise.
     """
-    some = [n for n in names if TABLE[n].integrators or not decided.problem.friction]
     inside = context.with_nuisances_of(decided)
-    found = _likeliest_colour(inside, inside.fit(some, known.order, (*ready, decided)))
+    found = _likeliest_colour(inside, inside.fit(names, known.order, (*ready, decided)))
     first = context.problem.colour
     start = context.refit(found[0], first) if found and not known.structure else None
     if start is None:
