@@ -107,6 +107,21 @@ def test_a_relay_whose_first_cycle_is_smaller_shows_its_play(band, noise):
     assert found.ultimate_gain == pytest.approx(ultimate_point(PROCESS).gain, rel=0.01)
 
 
+def test_a_joint_that_rings_is_not_taken_for_lags_with_a_play():
+    """Of its own structure no play is left, which is no reason to leave that structure out."""
+    ringing = complex(0.2 / 30.0, math.sqrt(1.0 - 0.2**2) / 30.0)
+    joint = TransferFunction(1.0, (), (ringing, ringing.conjugate(), 0.03), 1, 0.015)
+    plant = VirtualProcess(joint, disturbances=Disturbances(quantisation=4e-4), seed=1)
+    tune = RelayExperiment(ExperimentParameters(command_min=-2.0, command_max=2.0), 0.0)
+    for k in range(2000):
+        plant.command(tune.step(0.005 * k, plant.measure(0.005 * k)))
+        if tune.finished:
+            break
+    found = identify(tune.record())
+    assert found.play == 0.0
+    assert found.ultimate_gain == pytest.approx(ultimate_point(joint).gain, rel=0.03)
+
+
 def test_the_interval_of_the_ultimate_gain_holds_both_sides():
     found = analyse(record_of(UP_AND_DOWN, falling_gain=0.7), alone=True).model
     above, below = found.effects
