@@ -253,12 +253,18 @@ class FitContext:
         return [term for term, may_be in possible.items() if not may_be]
 
     def near(self, problem: Problem, state: Trial) -> Candidate | None:
-        """Fit a problem from the fit of a similar one; None as for :meth:`candidate`.
+        """Fit a problem, without terms that come out impossible, from the fit of a similar one.
+
+        It is None as for :meth:`candidate`.
 
         :param problem: what is fitted.
         :param state: the fit of the similar one.
         """
-        return self.candidate(problem, _refined(problem, state))
+        state = _refined(problem, state)
+        if none := self._impossible(problem, state):
+            problem = without(problem, none)
+            state = _refined(problem, state)
+        return self.candidate(problem, state)
 
     def _score(self, problem: Problem, state: Trial, model: TransferFunction) -> float:
         n = problem.time.size
