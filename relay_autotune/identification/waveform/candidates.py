@@ -253,18 +253,12 @@ class FitContext:
         return [term for term, may_be in possible.items() if not may_be]
 
     def near(self, problem: Problem, state: Trial) -> Candidate | None:
-        """Fit a problem, without terms that come out impossible, from the fit of a similar one.
-
-        It is None as for :meth:`candidate`.
+        """Fit a problem from the fit of a similar one; None as for :meth:`candidate`.
 
         :param problem: what is fitted.
         :param state: the fit of the similar one.
         """
-        state = _refined(problem, state)
-        if none := self._impossible(problem, state):
-            problem = without(problem, none)
-            state = _refined(problem, state)
-        return self.candidate(problem, state)
+        return self.candidate(problem, _refined(problem, state))
 
     def _score(self, problem: Problem, state: Trial, model: TransferFunction) -> float:
         n = problem.time.size
@@ -454,6 +448,17 @@ class FitContext:
         :param colour: of the noise; None: white.
         """
         return self.near(replace(candidate.problem, colour=colour), candidate.state)
+
+    def in_colour(self, candidate: Candidate, colour: Colour | None) -> Candidate | None:
+        """Refit a candidate, without terms that come out impossible in the colour.
+
+        :param candidate: of this context's samples.
+        :param colour: of the noise; None: white.
+        """
+        problem = replace(candidate.problem, colour=colour)
+        state = _refined(problem, candidate.state)
+        none = self._impossible(problem, state)
+        return self.near(without(problem, none), state) if none else self.candidate(problem, state)
 
     def _family(self, name: str, order: int) -> Iterator[Structure]:
         """Yield the structures of a name that there are samples enough for."""

@@ -29,6 +29,7 @@ from relay_autotune.identification.waveform.candidates import (
     FitContext,
     as_in,
     drop_first_dead_time,
+    nuisances_of,
 )
 from relay_autotune.identification.waveform.fit_covariance import Fit, raw_residual
 from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem
@@ -415,7 +416,8 @@ def _with_terms(
 ) -> list[Candidate]:
     """Return structures with the terms of one candidate, in the likeliest colour, the best first.
 
-    The best structure of all may need further terms than a simple one.
+    The best structure of all may need other terms than a simple one, with which all are compared
+    again.
 
     :param context: the samples, and the terms that may be estimated.
     :param known: the structure, if it is known.
@@ -423,17 +425,20 @@ def _with_terms(
     :param decided: has the terms, in white noise.
     :param ready: fitted before, in white noise.
     """
-    inside = context.with_nuisances_of(decided)
-    found = _likeliest_colour(inside, inside.fit(names, known.order, (*ready, decided)))
-    first = context.problem.colour
-    start = context.refit(found[0], first) if found and not known.structure else None
-    if start is None:
-        return found
-    again = _with_best_terms(context, [start])
-    if again is start:
-        return found
-    other = _with_terms(context, known, names, again, ready)
-    return min(other or found, found, key=lambda each: each[0].score)
+    best: list[Candidate] = []
+    tried: set[tuple[bool, ...]] = set()
+    while (terms := nuisances_of(decided.problem)) not in tried:
+        tried.add(terms)
+        inside = context.with_nuisances_of(decided)
+        found = _likeliest_colour(inside, inside.fit(names, known.order, (*ready, decided)))
+        if not found:
+            break
+        best = min(best or found, found, key=lambda each: each[0].score)
+        start = context.refit(found[0], context.problem.colour)
+        if start is None or known.structure:
+            break
+        decided = _with_best_terms(context, [start])
+    return best
 
 
 def _with_best_terms(context: FitContext, found: Sequence[Candidate]) -> Candidate:
@@ -518,7 +523,7 @@ def names_near(fit: Fit) -> list[str]:
 
 def _in(colour: Colour | None, found: list[Candidate], context: FitContext) -> list[Candidate]:
     """Return candidates fitted in one colour, the best first."""
-    again = (context.refit(c, colour) for c in found)
+    again = (context.in_colour(c, colour) for c in found)
     return sorted((c for c in again if c is not None), key=lambda c: c.score)
 
 
