@@ -182,20 +182,20 @@ def _fitted(records: Sequence[Record], fit: Fit, residual: FloatArray) -> FloatA
     fitted = np.full(len(record), math.nan)
     thinned = problem.colour is not None or 2 * problem.time.size <= len(record)
     if thinned and len(records) == 1:
-        # It was fitted to some of the samples only.
+        # It was fitted to some of the samples only. Free motion and drift begin with the first.
+        step = int(np.max(np.diff(problem.index), initial=1))
+        part = slice(int(problem.index[0]), int(problem.index[-1]) + step)
+        time = record.time[part]
         every = replace(
             problem,
-            time=record.time,
-            y=np.zeros(len(record)),
-            index=np.arange(len(record)),
+            time=time,
+            y=np.zeros(time.size),
+            index=np.arange(time.size),
             weight=None,
             colour=None,
         )
-        columns = every.columns(fit.state.theta)
-        fitted = record.measurement[0] + scale * (fit.state.coefficients @ columns)
-        step = int(np.max(np.diff(problem.index), initial=1))
-        # What comes before the first and after the last of those is left out.
-        fitted[: problem.index[0]] = fitted[problem.index[-1] + step :] = math.nan
+        answer = fit.state.coefficients @ every.columns(fit.state.theta)
+        fitted[part] = record.measurement[0] + scale * answer
         return np.asarray(fitted)
     own = problem.index < len(record)
     used = problem.index[own]
