@@ -73,11 +73,11 @@ def without_disturbance(
         if alone is None:
             raise found
         return alone
-    if alone is None:
-        return found
-    begin = int(np.argmax(np.isfinite(alone.fitted))) if alone.fitted.size else 0
-    better = _unexplained(alone, record) < _BETTER * _unexplained(found, record, begin)
-    return alone if better else found
+    if alone is not None:
+        begin = int(np.argmax(np.isfinite(alone.fitted))) if alone.fitted.size else 0
+        if _unexplained(alone, record) < _BETTER * _unexplained(found, record, begin):
+            return alone
+    return found
 
 
 def _of_end(record: Record, identify: Callable[[Record], Identification]) -> Identification | None:
