@@ -20,6 +20,7 @@ import numpy as np
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem, pulse
+from relay_autotune.identification.waveform.rational import stepped
 from relay_autotune.identification.waveform.residuals import (
     IMITATES_A_DRIFT,
     Colour,
@@ -79,6 +80,8 @@ TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "ends", "fric
 _HIDDEN = frozenset(("drift", "relaxation", "past", "ends"))
 # Steps of a fit with a further term or in another colour, and how often a load and ends are moved.
 _STEPS, _MOVES = 15, 4
+# Dead time on either side of a zero at 0, as a share of all times together.
+_ASIDE = 0.1
 # Gain in a score that changes no choice.
 LITTLE = 0.5
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
@@ -142,7 +145,7 @@ class FitContext:
     sign: int
     held: bool
     loads: bool
-    _fopdts: dict[tuple[object, ...], Trial] = field(default_factory=dict, repr=False)
+    _plain: dict[tuple[object, ...], Trial] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, problem: Problem, sign: int, *, held: bool) -> FitContext:
@@ -356,12 +359,11 @@ class FitContext:
         """
         if not any(nuisances_of(problem)):
             return self.fopdt
-        # The samples of a first dead time may have been dropped.
-        key = (problem.time.size, problem.load, problem.ends, *nuisances_of(problem))
-        if key not in self._fopdts:
+        key = _fitted(problem)
+        if key not in self._plain:
             starts = [self.fopdt.theta, *start_fopdt(problem, self.sign)]
-            self._fopdts[key] = best_of(problem, starts)
-        return self._fopdts[key]
+            self._plain[key] = best_of(problem, starts)
+        return self._plain[key]
 
     @cached_property
     def terms(self) -> list[tuple[str, ...]]:
@@ -390,7 +392,7 @@ class FitContext:
         fopdt = self._fopdt_of(problem)
         # A FOPDT has the longest dead time of all, since it includes every small lag.
         problem = drop_first_dead_time(problem, fopdt)
-        return replace(self, problem=problem, fopdt=fopdt, _fopdts={})
+        return replace(self, problem=problem, fopdt=fopdt, _plain={})
 
     def fit(
         self, names: Iterable[str], order: int = 0, ready: Sequence[Candidate] = ()
@@ -481,7 +483,43 @@ class FitContext:
             return self.fopdt
         if known and problem.structure == UNSTABLE_FOPDT:
             return self.unstable
-        return multistart(problem, self._starts(self.guess, problem.structure), least)
+        structure = problem.structure
+        state = multistart(problem, self._starts(self.guess, structure), least)
+        if structure.zero is not None:
+            return self._beside_its_zero(problem, state, least)
+        if state is not None:
+            self._plain[_fitted(problem)] = state
+        return state
+
+    def _beside_its_zero(
+        self, problem: Problem, state: Trial | None, least: float
+    ) -> Trial | None:
+        """Return a fit with a zero, begun anew where the structure without it explains more.
+
+        It explains at least as much, or it is in a wrong minimum. Where the zero is 0, dead time
+        and zero act alike to first order, and the search would stay: it begins on one side.
+
+        :param problem: with a zero.
+        :param state: its fit; None where it is hopeless beside the least one.
+        :param least: mean square of the best structure so far.
+        """
+        structure = problem.structure
+        without_it = replace(problem, structure=replace(structure, zero=None))
+        within = self._plain.get(_fitted(problem)) or self._best_fit(without_it, least)
+        if within is None or (state is not None and state.cost < within.cost):
+            return state
+        aside = np.append(np.zeros(within.theta.size - 1), _ASIDE)
+        starts = (stepped(structure, within.theta, by) for by in (-aside, aside))
+        nearer = min((evaluate(problem, theta) for theta in starts), key=lambda s: s.cost)
+        again = refine(problem, nearer, tolerance=TRIAL)
+        return again if state is None else min(state, again, key=lambda s: s.cost)
+
+
+def _fitted(problem: Problem) -> tuple[object, ...]:
+    """Return what tells the fits of one context apart, whose structures have no zero."""
+    # The samples of a first dead time may have been dropped.
+    terms = problem.load, problem.ends, *nuisances_of(problem)
+    return problem.structure.denominator, problem.time.size, *terms
 
 
 def _refined(problem: Problem, state: Trial) -> Trial:
