@@ -444,15 +444,7 @@ class FitContext:
         return [c for c in found if c is not None and c.model.process_sign * self.sign < 0]
 
     def refit(self, candidate: Candidate, colour: Colour | None) -> Candidate | None:
-        """Fit a candidate in another colour, from where it is.
-
-        :param candidate: of this context's samples.
-        :param colour: of the noise; None: white.
-        """
-        return self.near(replace(candidate.problem, colour=colour), candidate.state)
-
-    def in_colour(self, candidate: Candidate, colour: Colour | None) -> Candidate | None:
-        """Refit a candidate, without terms that come out impossible in the colour.
+        """Fit a candidate in another colour, without terms that come out impossible there.
 
         :param candidate: of this context's samples.
         :param colour: of the noise; None: white.

@@ -469,7 +469,9 @@ def _with_best_terms(context: FitContext, found: Sequence[Candidate]) -> Candida
 def _in_own_colour(context: FitContext, candidate: Candidate) -> Candidate:
     """Return a candidate in the colour of its residual, or white where that is likelier."""
     colour = _colour(candidate.problem, candidate.state)
-    coloured = None if colour is None else context.refit(candidate, colour)
+    if colour is None:
+        return candidate
+    coloured = context.near(replace(candidate.problem, colour=colour), candidate.state)
     return candidate if coloured is None else min(candidate, coloured, key=lambda c: c.score)
 
 
@@ -523,7 +525,7 @@ def names_near(fit: Fit) -> list[str]:
 
 def _in(colour: Colour | None, found: list[Candidate], context: FitContext) -> list[Candidate]:
     """Return candidates fitted in one colour, the best first."""
-    again = (context.in_colour(c, colour) for c in found)
+    again = (context.refit(c, colour) for c in found)
     return sorted((c for c in again if c is not None), key=lambda c: c.score)
 
 
