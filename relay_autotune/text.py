@@ -5,9 +5,9 @@
 
 A name in a file, or a reason from the network, may hold sequences that move a terminal's cursor,
 change its title or colours, reverse the direction of writing, or begin a new line that looks like
-one of ours. Such text is escaped where it enters, so that it can be told from our own lines and
-can be typed as shown. File names must stay unchanged for opening, so they are escaped only where
-they are shown.
+one of ours. Such text is escaped where it enters, so that it differs from our own lines and can
+be typed as shown. File names must stay unchanged for opening, so they are escaped only where
+they are printed.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _FINEST = 5e-5
 # Below it numbers have no exponent, and a share below this is shown as none.
 _PLAIN, _UNSEEN = 1e6, 5e-4
 
-# Interval at which users are told what is waited for [s]: below a second on a busy machine, too.
-TOLD_EVERY = 0.8
+# Interval of the sentences on what is waited for [s]: below a second on a busy machine, too.
+PROGRESS_EVERY = 0.8
 # The same in a log, which nobody watches line by line [s].
 LOGGED_EVERY = 10.0
 
@@ -68,10 +68,10 @@ def span_text(seconds: float, samples: int, lost: int) -> str:
     :param samples: how many; 0: not known.
     :param lost: how many more were sent.
     """
-    told = f"{digits(seconds)} s"
+    text = f"{digits(seconds)} s"
     if samples:
-        told += f", {counted(samples, 'sample')}" + f", {lost} lost" * bool(lost)
-    return told
+        text += f", {counted(samples, 'sample')}" + f", {lost} lost" * bool(lost)
+    return text
 
 
 def duration(seconds: float) -> str:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError, system_says
-from relay_autotune.text import LOGGED_EVERY, TOLD_EVERY, duration, in_units, visible
+from relay_autotune.text import LOGGED_EVERY, PROGRESS_EVERY, duration, in_units, visible
 
 if TYPE_CHECKING:
     from relay_autotune.control.step_choice import StepRange
@@ -280,11 +280,11 @@ class Working:
         began, line, expected = time.monotonic(), self._line, self._expected
         known = math.isfinite(expected)
         about = f" of about {max(expected, 1.0):.0f} s" if known else ""
-        wait = _SOON if line.in_place else TOLD_EVERY
+        wait = _SOON if line.in_place else PROGRESS_EVERY
         if (self._patient or (known and expected < LOGGED_EVERY)) and not line.in_place:
             wait = LOGGED_EVERY
         while not self._over.wait(wait):
-            wait = TOLD_EVERY if line.in_place else LOGGED_EVERY
+            wait = PROGRESS_EVERY if line.in_place else LOGGED_EVERY
             ran = time.monotonic() - began
             if known and ran > expected:
                 about = f", about {max(expected, 1.0):.0f} s were expected"

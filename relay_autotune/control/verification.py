@@ -39,7 +39,7 @@ GAIN_RANGE = (0.6, 1.7)
 MS_RATIO = 1.3
 # Allowance for noise in each comparison, in standard deviations.
 NOISE_ALLOWANCE = 3.0
-# By so many standard deviations the largest of some six samples about a peak is above it.
+# Standard deviations by which the largest of some six samples about a peak is above it.
 _AT_PEAK = 1.27
 # A deviation this many times the largest predicted one ends the step at once.
 RUNAWAY = 3.0
@@ -412,10 +412,10 @@ def compare(
         why = Code.NARROWLY(narrow=", ".join(narrow), numbers=numbers)
     return Comparison(
         passed=not problems,
-        # Beside the sentence, for those who tell the numbers by themselves.
+        # For those who print the numbers without the sentence.
         why=why.plus(gain_uncertainty=unsure, settled_band=band),
         measured=measured,
-        # What is told is within the band of the measured one; the limit is without noise.
+        # The time given is into the band of the measured one; the limit is without noise.
         expected=replace(expected, settling_time=in_band),
         predicted=predicted,
         fit=1.0 - rms / spread if spread > 0.0 else math.nan,

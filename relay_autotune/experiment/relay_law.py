@@ -353,7 +353,7 @@ class Levels:
     def growth_for(self, half_swing: float, least: float) -> float | None:
         """Return the factor by which the amplitude must grow, None if it is large enough.
 
-        It is 1 where the swing may reach the least one at the present amplitude.
+        It is 1 where the present amplitude may reach the least swing.
 
         :param half_swing: half the swing of the measurement over the last cycle [y].
         :param least: the half swing that is large enough [y].

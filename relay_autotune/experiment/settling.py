@@ -21,7 +21,7 @@ NOISE_SAMPLES = 50
 # Without noise, a transient is over when no more than this part of it is left.
 _REMAINDER = 0.01
 
-# Latest end of the settling that is told, as a multiple of the time so far.
+# Latest end of the settling that is predicted, as a multiple of the time so far.
 _FURTHEST = 20.0
 
 # Samples in each mean that shows a slow movement.
@@ -300,7 +300,7 @@ class Settling:
         """Return when the measurement will be steady, if its slope fades as it did [s].
 
         :param interval: mean interval of the samples [s].
-        :returns: the time since the settling began; NaN: it cannot be told.
+        :returns: the time since the settling began; NaN: it cannot be predicted.
         """
         samples, rest = self._next_look, self.rest
         while samples < NOISE_SAMPLES:

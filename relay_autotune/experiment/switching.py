@@ -90,7 +90,7 @@ _SHOWS = 10
 # it has moved for as long as that, if it moves at all.
 _RESTS_AFTER = 2.0
 
-# Least difference of the periods of two cycles that is told, as a fraction.
+# Least difference of the periods of two cycles that is reported, as a fraction.
 _DIFFER = 0.001
 
 _SIGNS = {1: "positive", -1: "negative"}

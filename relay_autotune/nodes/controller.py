@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""controller_node: a PI or PID controller that takes new gains when it is told to.
+"""controller_node: a PI or PID controller that takes new gains on request.
 
 controller_node --gains FILE starts it with the parameters and topics that tune_loop has written.
 """
@@ -206,10 +206,10 @@ class ControllerNode(ServedNode):
             self.create_subscription(kind, topic, take, quality.RESULT)
         # The loop must keep running while these services wait for the disk or another node.
         waiting = {"callback_group": ReentrantCallbackGroup()}
-        serve(self, Trigger, "~/apply", lambda _: self._told(self._apply()), **waiting)
+        serve(self, Trigger, "~/apply", lambda _: self._logged(self._apply()), **waiting)
         serve(self, Trigger, "~/discard", self._discard)
         serve(self, Trigger, "~/before", lambda _: self._keeper.before())
-        serve(self, Trigger, "~/revert", lambda _: self._told(self._keeper.revert()), **waiting)
+        serve(self, Trigger, "~/revert", lambda _: self._logged(self._keeper.revert()), **waiting)
         serve(self, SetBool, "~/automatic", self._switch)
         ask_before_changes(self, self._require_settable)
         self.add_post_set_parameters_callback(self._after_set)
@@ -454,15 +454,15 @@ class ControllerNode(ServedNode):
             self._tried = self._newest
             self.executor.create_task(self._apply_and_tell)
 
-    async def _told(self, change: Awaitable[str]) -> str:
-        """Return the sentence on a change of the gains, which the log has, too."""
+    async def _logged(self, change: Awaitable[str]) -> str:
+        """Log the sentence on a change of the gains, and return it."""
         said = await change
         self.get_logger().info(said)
         return said
 
     async def _apply_and_tell(self) -> None:
         try:
-            await self._told(self._apply())
+            await self._logged(self._apply())
         except RelayAutotuneError as error:
             self.get_logger().error(str(error))
 

@@ -25,7 +25,7 @@ _LOOK_EVERY, _LOST_AFTER = 1.0, 5.0
 _AGAIN = 0.2
 _ACTIVE = "active"
 _LIST = "/list_controllers"
-# Types that write what they are told into their command interfaces, and nothing else.
+# Types that write the values they receive into their command interfaces, and nothing else.
 _FORWARDING = {
     "forward_command_controller/ForwardCommandController",
     "forward_command_controller/MultiInterfaceForwardCommandController",
@@ -42,7 +42,7 @@ class ManagedController:
     :param name: its name.
     :param type_name: the class, such as ``pid_controller/PidController``.
     :param state: unconfigured, inactive, active or finalized.
-    :param rate: of its updates [Hz]; 0: not told.
+    :param rate: of its updates [Hz]; 0: not reported.
     :param needs: the command interfaces that it writes, in its own order; (): not configured.
     :param claims: those that it owns now.
     :param reads: the state interfaces that it reads.

@@ -37,7 +37,7 @@ from relay_autotune.nodes.shell import prefix, ros_arguments
 from relay_autotune.nodes.tables import GAINS, rate_from, rate_of, sensor_parameters
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code, may_pass
-from relay_autotune.text import TOLD_EVERY, duration, visible
+from relay_autotune.text import PROGRESS_EVERY, duration, visible
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment, Verification
 from relay_autotune_msgs.msg import TransferFunction as ModelMessage
@@ -334,7 +334,7 @@ class GainsClient(LoopClient):
         begun = time.monotonic()
         while (waited := time.monotonic() - begun) < seconds and not leave():
             tell(f"the loop goes back, {duration(waited)} of {duration(seconds)}")
-            self.wait(leave, min(TOLD_EVERY, seconds - waited))
+            self.wait(leave, min(PROGRESS_EVERY, seconds - waited))
 
     def _verified(self, goal: Any, tell: Callable[[str], None], leave: Callable[[], bool]) -> Any:
         """Have the steps made, and return the `Verify.Result`."""
@@ -351,7 +351,7 @@ class GainsClient(LoopClient):
             # The gains that are offered reach the node a moment later.
             if code is not Code.NONE_WAIT:
                 tell(f"waiting: {result.reason}")
-            self.wait(leave, TOLD_EVERY)
+            self.wait(leave, PROGRESS_EVERY)
         raise LoopError("the verification was ended before it began: the gains are as before")
 
     def _ended(self, goal: Any, leave: Callable[[], bool]) -> Any:

@@ -44,8 +44,8 @@ from relay_autotune.text import visible
 _VERSION = 1
 # A file of ours is smaller [B]: some two thousand sets, each of a few names and numbers.
 _LARGEST = 2_000_000
-# Length of a text of a file that is told.
-_TOLD = 80
+# Length to which a text of a file is cut in a message.
+_TEXT_LENGTH = 80
 
 
 class JournalError(RelayAutotuneError):
@@ -215,7 +215,7 @@ def _history_of(found: dict[str, Any]) -> GainsHistory:
 
 def _short(text: object) -> str:
     """Return a text of a file in one short line."""
-    return visible(str(text)[:_TOLD])
+    return visible(str(text)[:_TEXT_LENGTH])
 
 
 # Time between attempts when the place of the gains does not answer [s].

@@ -22,7 +22,7 @@ from relay_autotune.experiment.phases import State
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.reasons import Code, Reason
-from relay_autotune.text import LOGGED_EVERY, TOLD_EVERY
+from relay_autotune.text import LOGGED_EVERY, PROGRESS_EVERY
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import TransferFunction
 from relay_autotune_msgs.srv import StartTune
@@ -46,7 +46,7 @@ class Narrator:
         self._words = words
         self._tell = tell
         self._logged, self._logged_at = "", -math.inf
-        self._timer = node.create_timer(TOLD_EVERY, self.now, clock=STEADY, autostart=False)
+        self._timer = node.create_timer(PROGRESS_EVERY, self.now, clock=STEADY, autostart=False)
 
     def now(self) -> None:
         """Tell the present sentence, and the next one a second later."""
@@ -162,7 +162,7 @@ class _Tune:
     goal: Any
     result: Tune.Result = field(default_factory=Tune.Result)
     newest: TransferFunction = field(default_factory=TransferFunction)
-    """Model that is not told yet."""
+    """Model that is not published yet."""
     model: Any = None
     """The newest model, which is kept beyond the feedback that tells it."""
 
@@ -247,7 +247,7 @@ class TuneAction:
             feedback.period = last.period
             feedback.amplitude = last.amplitude
         tune.goal.publish_feedback(feedback)
-        # Each model is told once, since it is long.
+        # Each model is published once, since it is long.
         tune.newest = TransferFunction()
 
     def note(self, name: str, message: Any) -> None:

@@ -48,7 +48,7 @@ _OPTIONAL: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class DofState:
-    """What the controller last told of one degree of freedom.
+    """What the controller last reported of one degree of freedom.
 
     :param reference: its set-point [y]; NaN: none was given.
     :param feedback: its measurement [y].
@@ -108,7 +108,7 @@ class JointLoop(_Parts):
     :param clamps: limits of the command [u].
     :param above: names of the active controllers that write its references.
     :param states: of all joints, in the same order.
-    :param within: limits of the measurement in robot_description [y]; None: not told.
+    :param within: limits of the measurement in robot_description [y]; None: not given.
     :param command_within: likewise of the command [u].
     """
 
@@ -403,7 +403,7 @@ def is_continuous(description: str, joint: str) -> bool:
 
 
 def limits_in(description: str, joint: str, interface: str) -> tuple[float, float] | None:
-    """Return the limits of a joint's position, velocity or effort; None: not told.
+    """Return the limits of a joint's position, velocity or effort; None: not given.
 
     :param description: the robot's description, URDF with or without a part of ros2_control.
     :param joint: name of the joint.

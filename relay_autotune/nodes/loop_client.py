@@ -463,7 +463,7 @@ class LoopClient:
             return sorted({quality.who(end) for end in ends} - own)
 
         self.rest(self._joined + quality.ALL_KNOWN_AFTER - time.monotonic())
-        # A publisher is told before the name of its node.
+        # A publisher is known before the name of its node.
         self.wait(lambda: quality.UNNAMED not in found(), _LISTEN)
         return " and ".join(found())
 
@@ -483,7 +483,7 @@ class LoopClient:
         :param topic: its name without a remapping.
         :param type_name: its message type.
         :param published: whether the relay_node publishes it.
-        :raises LoopError: if it cannot be told from others.
+        :raises LoopError: unless exactly one topic can be it.
         """
         space, _, name = relay.rpartition("/")
         ends = (

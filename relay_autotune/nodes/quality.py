@@ -61,7 +61,7 @@ STATUS = QoSProfile(
 """Profile of the status that shows whether a tune runs, and whether relay_node lives."""
 
 # A node that was there before may be unknown until it next announces itself [s]: Fast DDS does so
-# every 3 s, and its publishers are told within some 0.1 s.
+# every 3 s, and its publishers are known within some 0.1 s.
 ALL_KNOWN_AFTER = 3.5
 
 
@@ -176,7 +176,7 @@ def nearest(
 
 
 UNNAMED = "a node not known yet"
-"""Stands for the name of a node that the middleware has not told yet."""
+"""Stands for the name of a node that the middleware has not given yet."""
 
 
 def who(end: Any) -> str:

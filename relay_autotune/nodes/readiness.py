@@ -480,21 +480,21 @@ def _expected(
         amplitude, cycle = last
         ratio = parameters.amplitude / amplitude if parameters.amplitude else 1.0
         swing, ends = cycle.amplitude * ratio, ""
-        told = f"a swing of about {swing:.2g} y each way in {duration(cycle.period)}, as last time"
+        text = f"a swing of about {swing:.2g} y each way in {duration(cycle.period)}, as last time"
         if rest is None or parameters.finds_amplitude:
-            return told, Mark.OK
+            return text, Mark.OK
         mend = "give wider limits, or a smaller amplitude"
     elif rest is None or not parameters.finds_amplitude:
-        told = f"how far the measurement swings is not known before the first tune{ends}"
-        return told, Mark.OK
+        text = f"how far the measurement swings is not known before the first tune{ends}"
+        return text, Mark.OK
     else:
         seen, noise = np.array(samples.before()), rest.noise_std
         clear = clear_swing(noise, parameters.band(noise), seen)
         setpoint = rest.mean if math.isnan(parameters.setpoint) else parameters.setpoint
         swing = sought_swing(parameters, clear, noise, setpoint, seen)
-        told = f"a swing of at least {swing:.2g} y each way, where the levels stop growing"
+        text = f"a swing of at least {swing:.2g} y each way, where the levels stop growing"
         mend = "give wider limits"
     beyond = [f"{end:g}" for end in (low, high) if abs(end - rest.mean) <= swing]
     if beyond:
-        return f"{told}; it would end the tune at {' or '.join(beyond)} y: {mend}", Mark.NOTE
-    return told + ends, Mark.OK
+        return f"{text}; it would end the tune at {' or '.join(beyond)} y: {mend}", Mark.NOTE
+    return text + ends, Mark.OK

@@ -123,7 +123,7 @@ class Recording:
         """Take a sign of life of the identifier.
 
         :param working: True if it still works on the experiment.
-        :param text: what the work is at, or why model or gains will not come; "": not told.
+        :param text: what the work is at, or why model or gains will not come; "": not known.
         """
         timer = self._timer
         if timer is None:
@@ -185,7 +185,7 @@ class Recording:
     def wait_no_longer(self, reason: str) -> None:
         """Close it without the results that it lacks.
 
-        :param reason: why they are missing, unless identifier_node has told another one.
+        :param reason: why they are missing, unless identifier_node has given another one.
         """
         self._reason = self._reason or reason
         self.close(f"without {' and '.join(self._missing)}: {self._reason}")
@@ -283,7 +283,7 @@ class Recordings:
         :param experiment_id: its id, which names the folder.
         :param directory: where the folder is made.
         """
-        # Whoever is told of it may be in another folder.
+        # Absolute, since whoever reads the path may be in another folder.
         folder = Path(directory).expanduser().absolute() / experiment_id
         self._kept = {name: each for name, each in self._kept.items() if not each.is_closed}
         self._kept[experiment_id] = recording = Recording(self._node, self._ends(), folder)

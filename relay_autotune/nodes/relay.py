@@ -42,7 +42,7 @@ from relay_autotune_msgs.srv import StartTune
 ACKNOWLEDGE = Duration(seconds=0.2)
 # Where a tune that was started by the service is seen.
 WATCH = "the log of {}, or the topic /diagnostics, which tell each second how it goes"
-# Silence of the measurement that is told during a tune [s].
+# Silence of the measurement that is reported during a tune [s].
 SILENT = 0.5
 # How long the end of the process may wait for the last bytes of a recording [s].
 CLOSE_WITHIN = 3.0

@@ -109,7 +109,7 @@ class SignsOfLife:
 def said_by(message: Any) -> tuple[str, bool, str]:
     """Return experiment id, whether it is still in work, and a text.
 
-    That is what the work is at, or after it why results are missing; empty: neither is told.
+    That is what the work is at, or after it why results are missing; empty: neither is known.
 
     :param message: the `DiagnosticStatus`.
     """

@@ -128,7 +128,7 @@ class TuneClient(LoopClient):
         :param seconds: the time [s].
         :raises LoopError: if the node is lost.
         """
-        # A node that is lost during a tune is told with what that means for the plant.
+        # The error on a node lost during a tune says what that means for the plant.
         self._handle(self._answer.done, seconds)
         if self._answer.done() or not (why := self._why_gone(seconds)):
             return
@@ -232,7 +232,7 @@ class TuneClient(LoopClient):
         """Hear each measurement that relay_node hears.
 
         :param take: called with it [y].
-        :raises LoopError: if its topic cannot be told from others.
+        :raises LoopError: unless exactly one topic can be it.
         """
         values = self.values(self.name, ["measurement_type", "measurement_field"])
         reader = reader_of(*values.values())
@@ -251,7 +251,7 @@ class TuneClient(LoopClient):
 
         :param take: called with each command [u].
         :param cycle: called with each `RelayCycle`.
-        :raises LoopError: if the topic cannot be told from others.
+        :raises LoopError: unless exactly one topic can be it.
         """
         kind, field = self.values(self.name, ["command_type", "command_field"]).values()
         commands = CommandMessage(kind, field, "", taken=True, now_ns=time.time_ns)

@@ -333,7 +333,7 @@ class Verifier:
         succeeded = True
         try:
             self._end(*await self._course(goal.request))
-        except Exception as error:  # noqa: BLE001  the loop goes on, and the client is told
+        except Exception as error:  # noqa: BLE001  the loop goes on, and the client gets the reason
             succeeded = self._over is not None
             self._end(None, _why(error))
         assert self._over is not None
@@ -398,7 +398,7 @@ class Verifier:
                 message = await self._computed(partial(judged, tried, trial))
             except _EndedError:
                 raise
-            except Exception as error:  # noqa: BLE001  the client is told
+            except Exception as error:  # noqa: BLE001  the client gets the reason
                 return None, Code.NOT_JUDGED(why=str(_why(error)))
             self._found.append(message)
             self._full.publish(message)

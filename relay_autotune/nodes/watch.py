@@ -36,7 +36,7 @@ from relay_autotune.reasons import Code, Reason
 LOOK_EVERY, _LEAST_WAIT = 0.05, 1e-3
 # The last samples that are kept, and the time that they may cover [s].
 _KEPT, _WINDOW = 2000, 10.0
-# The least time by which rest is told [s]: a drift shows in less only where it is fast.
+# Shortest time over which rest is judged [s]: a drift shows in less only where it is fast.
 _LEAST_SPAN = 2.0
 # Longest silence of a sensor where measurement_timeout is 0: a time [s], or a number of usual
 # intervals if that is longer. Some samples in a row may be lost on the way, and the relay, which
@@ -181,7 +181,7 @@ class LastSamples:
 
     @property
     def are_enough(self) -> bool:
-        """Whether they cover a time in which their rate, and whether they rest, can be told."""
+        """Whether they cover enough time to judge their rate, and whether they rest."""
         return self._span >= _LEAST_SPAN or len(self._kept) == _KEPT
 
     @property

@@ -105,7 +105,7 @@ def test_a_log_has_a_line_each_ten_seconds_and_at_once_what_takes_longer(
 ):
     # ten seconds and less than one, two hundred times faster
     monkeypatch.setattr(terminal, "LOGGED_EVERY", 0.2)
-    monkeypatch.setattr(terminal, "TOLD_EVERY", 0.004)
+    monkeypatch.setattr(terminal, "PROGRESS_EVERY", 0.004)
     # Its thread may speak before anything that follows.
     work = Working("the work", expected)
     work.at("comparing")

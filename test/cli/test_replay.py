@@ -131,7 +131,7 @@ def test_the_process_is_found(tmp_path, capsys):
 def test_the_table_says_what_a_person_needs(tmp_path, capsys, monkeypatch):
     # On a terminal it says meanwhile what the computation is at, so that it has to be one.
     monkeypatch.setattr("relay_autotune.cli.jobs.analyse", analyse)
-    monkeypatch.setattr(terminal, "TOLD_EVERY", 0.02)
+    monkeypatch.setattr(terminal, "PROGRESS_EVERY", 0.02)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     write_bag(tmp_path / "bag", tmp_path, relay_record())
     status, out, err = run(capsys, tmp_path / "bag")
