@@ -334,9 +334,9 @@ def analyse_jointly(
     if isinstance(joint, Analysis):
         return joint
     first, chosen = joint.record, joint.model
-    told = unequal_amplitudes(records, chosen.model)
-    if told:
-        chosen = replace(chosen, warnings=(*chosen.warnings, told))
+    warning = unequal_amplitudes(records, chosen.model)
+    if warning:
+        chosen = replace(chosen, warnings=(*chosen.warnings, warning))
     found = Analysis(first, assess((chosen,), first))
     return _judged(found, records, task, joint.simple(task, alone=False), rng)
 

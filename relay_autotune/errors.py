@@ -62,9 +62,9 @@ class SelectionError(BagError):
         self._choices = tuple(choices)
 
     def __str__(self) -> str:
-        return self.told()
+        return self.with_choices()
 
-    def told(self, command: str = "") -> str:
+    def with_choices(self, command: str = "") -> str:
         """Return the error with a line to copy for each choice.
 
         :param command: to which the flags are added; empty: they stand alone.
@@ -78,7 +78,7 @@ class NotThereError(SelectionError):
     """A recording does not have a topic or column of the name that was given.
 
     :param lacking: what it does not have.
-    :param there: what it has; empty: that is told already.
+    :param there: what it has; empty: ``lacking`` says it already.
     """
 
     def __init__(self, lacking: str, there: str = "") -> None:

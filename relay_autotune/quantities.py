@@ -219,7 +219,7 @@ class ResultField:
     :param name: of the field.
     :param kind: its type.
     :param unit: of the number; "" for a pure number, a word or several values.
-    :param default: what stands where it is not told; MISSING: it has to be told.
+    :param default: what stands where it is not given; MISSING: it has to be given.
     :param lower: smallest number allowed.
     :param upper: largest number allowed.
     :param nan: True if NaN is allowed, which means that it was not estimated.

@@ -81,10 +81,10 @@ class Reason:
         if self.said:
             return self.said
         row = self.code.row
-        told, remedy, place = (_filled(t, self.values) for t in (row.found, row.remedy, _PLACE))
+        text, remedy, place = (_filled(t, self.values) for t in (row.found, row.remedy, _PLACE))
         if remedy:
-            told += f"{'; ' if ': ' in told else ': '}{remedy}"
-        return "; ".join((told + place, *map(str, self.notes)))
+            text += f"{'; ' if ': ' in text else ': '}{remedy}"
+        return "; ".join((text + place, *map(str, self.notes)))
 
 
 # Parts of several sentences.

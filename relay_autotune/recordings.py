@@ -104,7 +104,7 @@ def read_experiments(
 _HEADER: dict[str, Any] = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
 
 
-def _told(kind: type) -> dict[str, Any]:
+def _defaults_of(kind: type) -> dict[str, Any]:
     """Return the fields that a message has of one of our types, each with its default."""
     fields = [each for each in result_fields(kind) if each.message is not None]
     absent = {each.name: math.nan if each.nan else each.kind() for each in fields}
@@ -117,7 +117,7 @@ def _told(kind: type) -> dict[str, Any]:
 DEFAULTS: dict[str, dict[str, Any]] = {
     EXPERIMENT: {
         "header": _HEADER,
-        "settings": _told(RelaySettings),
+        "settings": _defaults_of(RelaySettings),
         "noise_std": math.nan,
         "sought_width": 0.0,
         **dict.fromkeys(("experiment_id", "reason", "sought"), ""),
@@ -129,11 +129,11 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     },
     CYCLE: {
         "header": _HEADER,
-        "settings": _told(RelaySettings),
+        "settings": _defaults_of(RelaySettings),
         "experiment_id": "",
         "lead_in": 0,
         **dict.fromkeys(("time", "measurement", "command"), ()),
-        **_told(Cycle),
+        **_defaults_of(Cycle),
     },
 }
 
@@ -230,19 +230,19 @@ def _missing_rows(record: Record) -> list[str]:
     gaps = gaps_of(record)
     if not gaps.before.size:
         return []
-    told = (
+    note = (
         f"gaps in the rows: {gaps.before.size}, the longest {gaps.longest:.3g} s, the first after "
         f"{record.time[gaps.before[0] - 1]:g} s (if a clock jumped, leave one side out with "
         "--start or --end)"
     )
     if gaps.hidden.size:
         end = record.time[gaps.hidden[0]]
-        told += (
+        note += (
             f"; over {gaps.hidden.size} of them the command changed, the first time before "
             f"{end:g} s, and nobody knows when: an experiment ends there, so log without gaps, or "
             f"add a row at each change"
         )
-    return [told]
+    return [note]
 
 
 def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
@@ -268,7 +268,7 @@ def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
 
 
 def _in_units(record: Record, units: Mapping[str, str]) -> Record:
-    """Return a record with those of its units that are told."""
+    """Return a record with those of its units that are known."""
     return replace(record, units={name: unit for name, unit in units.items() if is_unit(unit)})
 
 

@@ -23,11 +23,11 @@ from importlib.util import find_spec
 from relay_autotune.errors import output_refused
 
 
-def start(module: str, told_for: tuple[str, ...] = ()) -> int:
+def start(module: str, announced: tuple[str, ...] = ()) -> int:
     """Load an executable's module and run it.
 
     :param module: name of a module with a function main.
-    :param told_for: arguments with which it says first that it loads, for people wait for it.
+    :param announced: arguments with which it first says that it loads, since people wait for it.
     :return: the exit status.
     """
     # A process that was started with SIGINT ignored, as by nohup, keeps ignoring it.
@@ -44,7 +44,7 @@ def start(module: str, told_for: tuple[str, ...] = ()) -> int:
     sys.stdout = sys.stdout or os.fdopen(1, "w", closefd=False)
     sys.stderr = sys.stderr or os.fdopen(2, "w", closefd=False)
     name = module.rpartition(".")[2]
-    if set(told_for) & set(sys.argv):
+    if set(announced) & set(sys.argv):
         if find_spec("rclpy") is None:
             # Before it seems that something is looked at.
             sys.stderr.write(f"{name}: {_lacking(ModuleNotFoundError(name='rclpy'))}\n")
@@ -99,7 +99,7 @@ identifier_node = partial(start, "relay_autotune.nodes.identifier")
 plant_node = partial(start, "relay_autotune.nodes.plant")
 controller_node = partial(start, "relay_autotune.nodes.controller")
 simulated_loop = partial(start, "relay_autotune.cli.simulated_loop")
-tune_loop = partial(start, "relay_autotune.cli.tune_loop", told_for=("--measurement", "--joint"))
+tune_loop = partial(start, "relay_autotune.cli.tune_loop", announced=("--measurement", "--joint"))
 apply_gains = partial(start, "relay_autotune.cli.apply_gains")
 replay = partial(command, "relay_autotune.cli.replay")
 identify = partial(command, "relay_autotune.cli.identify")

@@ -85,7 +85,7 @@ class Log:
     :param measurement: the samples.
     :param command: what was commanded.
     :param dated: whether the times are since the epoch.
-    :param units: of the measurement, by "y", and of the command, by "u", as far as they are told.
+    :param units: of the measurement, by "y", and of the command, by "u", as far as they are known.
     :param notes: what was guessed or left out, each a sentence.
     """
 

@@ -431,22 +431,22 @@ class _Finder:
         assert by is not None
         wanted = [_text(name) for name in names]
         where = [k for k, name in enumerate(wanted) if name == chosen]
-        told = f"the list {by.field}" if by.depth is not None else f"the elements' {by.field}"
+        source = f"the list {by.field}" if by.depth is not None else f"the elements' {by.field}"
         if len(where) > 1:
             raise FieldError(
-                f"{self._shown()}: {told} has {chosen!r} {len(where)} times, so that it is not "
+                f"{self._shown()}: {source} has {chosen!r} {len(where)} times, so that it is not "
                 f"clear which element is meant"
             )
         if not where:
             near = difflib.get_close_matches(chosen, wanted, n=1)
             meant = f"; write {self._shown(near[0])}" if near else ""
             raise FieldError(
-                f"{self._shown()}: {told} has no {chosen!r}; it has "
+                f"{self._shown()}: {source} has no {chosen!r}; it has "
                 f"{_some_of(wanted) or 'no names'}{meant}"
             )
         if len(wanted) != count:
             raise FieldError(
-                f"{self._shown()}: {told} has length {len(wanted)}, but the array {count}"
+                f"{self._shown()}: {source} has length {len(wanted)}, but the array {count}"
             )
         return where[0]
 

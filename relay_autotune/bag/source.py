@@ -188,8 +188,8 @@ class Source:
             )
         if start[: len(self._magic)] != self._magic[: len(start)]:
             known = (*_OTHERS, *_TABLES)
-            told = next((what for head, what in known if start.startswith(head)), None)
-            found = f"it is {told}" if told else f"it begins with {start[:8]!r}"
+            kind = next((what for head, what in known if start.startswith(head)), None)
+            found = f"it is {kind}" if kind else f"it begins with {start[:8]!r}"
             raise BagError(
                 f"{self.path} is not {self._kind}: {found}; expected a bag or a CSV table"
             )

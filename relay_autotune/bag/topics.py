@@ -370,8 +370,8 @@ def named_field(root: Struct, field: str, topic: str) -> Path:
 
 def only_field(root: Struct) -> str | None:
     """Return the number that a message is about; None if it may be any of several."""
-    told = UNITS.get(root.name, {})
-    meant = [name for name, kind in root.fields if name in told and isinstance(kind, Number)]
+    units = UNITS.get(root.name, {})
+    meant = [name for name, kind in root.fields if name in units and isinstance(kind, Number)]
     found = meant or first_numbers(root, 2)
     return found[0] if len(found) == 1 and "[" not in found[0] else None
 

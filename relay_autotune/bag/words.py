@@ -49,7 +49,7 @@ _BARE = re.compile(
     r"mV|[kM]?Hz|[kM]W|mA|l/min|l/h|m3/h|m³/h|kg/h|t/h)\s*$"
 )
 _PERCENT = ("pct", "percent", "prozent")
-# Units of temperatures, pressures and speeds, which no actuator is told in.
+# Units of temperatures, pressures and speeds, in which nobody commands an actuator.
 _OF_SENSORS = re.compile(r"(deg ?|°)[CFK]|[kMm]?Pa|m?bar|psi|rpm")
 
 

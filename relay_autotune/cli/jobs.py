@@ -126,7 +126,7 @@ def replay(job: Job, working: Working | None = None) -> Done:
     """Read, identify and tune; an error becomes part of the result.
 
     :param job: what to do.
-    :param working: is told how much of a bag is read, and what the computation is at.
+    :param working: shows how much of a bag is read, and what the computation is at.
     """
     said: list[str] = []
     analyses: tuple[Analysis, ...] = ()
@@ -142,7 +142,7 @@ def replay(job: Job, working: Working | None = None) -> Done:
                     said.append("\n".join([f"{job.name}:", *lines]))
     except SelectionError as error:
         command = shlex.join(("replay", *job.paths))
-        return _failed(job, said, error.told(command), USAGE)
+        return _failed(job, said, error.with_choices(command), USAGE)
     except RelayAutotuneError as error:
         # Doubtful gains are there, although they are not exported unasked.
         return _failed(job, said, str(error), status_of(analyses) or NOTHING_FOUND)
@@ -178,7 +178,7 @@ def analysed(job: Job, said: list[str], working: Working | None = None) -> tuple
 
     :param job: what to do.
     :param said: gets sentences for standard error.
-    :param working: is told how much of a bag is read, and what the computation is at.
+    :param working: shows how much of a bag is read, and what the computation is at.
     :raises RelayAutotuneError: if the recording cannot be read, or lacks what is asked for.
     """
     progress = working.share if working else None

@@ -186,11 +186,11 @@ def _fundamental(record: Record) -> tuple[float, complex]:
     weight = np.diff(time) * np.exp(-1j * frequency * (time[:-1] - time[0]))
     turns = weight.sum()
     length = float(time[-1] - time[0])
-    said, told = (
+    y, u = (
         complex((column[part] * weight).sum() - column[part] @ np.diff(time) / length * turns)
         for column in (record.measurement, record.command)
     )
-    return frequency, said / told if told != 0.0 else complex(math.nan)
+    return frequency, y / u if u != 0.0 else complex(math.nan)
 
 
 def check_finding(

@@ -146,9 +146,9 @@ def settings(gains: Gains, law: ProgramLaw, target: Target) -> str:
     :param law: the law.
     :param target: where they go.
     """
-    told, values = _remarks_and_values(gains, law, target)
+    remarks, values = _remarks_and_values(gains, law, target)
     parts = [
-        *_comments(gains, target, (gains.reason and f"{gains.reason}.", *told), law.remark),
+        *_comments(gains, target, (gains.reason and f"{gains.reason}.", *remarks), law.remark),
         law.head.format(node=_key(target.node), dof=_key(target.dof)),
         *(law.line.format(name=name, value=value) for name, value in values),
         law.tail,
@@ -191,17 +191,17 @@ def _remarks_and_values(
         known = math.isfinite(low) or math.isfinite(high)
         set_there = f"; set them to {' and '.join(ends)}" if known else ""
         where = f"Limits of the command are set in the program{set_there}. "
-    told: tuple[str, ...] = (
+    remarks: tuple[str, ...] = (
         f"For {law.program}.{of_command}",
         f"{where}At the limits of the command: {law.limits}.",
     )
     if law.scale:
-        told += (law.scale,)
+        remarks += (law.scale,)
     if law.sign:
         sign = law.sign.format(sign="positive" if gains.kc < 0.0 else "negative")
-        told += (f"{sign}, with kc {gains.kc:.6g}.",)
+        remarks += (f"{sign}, with kc {gains.kc:.6g}.",)
     elif law.form == "parallel" and scale * gains.kc < 0.0:
-        told += ("All gains are negative, since a higher command lowers the measurement.",)
+        remarks += ("All gains are negative, since a higher command lowers the measurement.",)
     at = law.at(replace(gains, kc=scale * gains.kc), gains.law_period)
     stays = ("antiwindup_strategy",) if target.is_set_up else ()
     values = [(each.name, each.of(at)) for each in law.settings if each.name not in stays]
@@ -215,11 +215,11 @@ def _remarks_and_values(
             present = min(max(0.0, low), high)
             done = f": put it in place of {present:g}" if law.start.needs else ", and is left out"
             rest = f" It is not known here{done}." * bool(law.start.name)
-        told += (f"Start without a bump: {law.start.words}{rest}",)
+        remarks += (f"Start without a bump: {law.start.words}{rest}",)
         if law.start.name and (known or law.start.needs):
             values.append((law.start.name, law.start.value(at, present)))
     written = [(name, value) for name, value in values if value is not None]
-    return told, [(n, value if isinstance(value, str) else number(value)) for n, value in written]
+    return remarks, [(n, v if isinstance(v, str) else number(v)) for n, v in written]
 
 
 def _full_command(law: ProgramLaw, target: Target) -> float:
@@ -356,17 +356,17 @@ def _key(name: str) -> str:
 
 
 def _comments(gains: Gains, target: Target, more: Sequence[str], remark: str) -> list[str]:
-    told = [
+    lines = [
         f"Gains by the rule {gains.rule} of relay_autotune: Ms {gains.ms:.3g}, Mt {gains.mt:.3g}.",
         f"ISA form: kc {gains.kc:.6g} u/y, ti {gains.ti:.6g} s, td {gains.td:.6g} s, "
         f"tf {gains.tf:.6g} s, b {gains.b:g}.",
     ]
     if gains.law:
-        told.append(f"Designed for {gains.law} every {gains.law_period:.6g} s.")
+        lines.append(f"Designed for {gains.law} every {gains.law_period:.6g} s.")
         if not target.is_set_up:
-            told[-1] += " If it runs at another period, export again with --sample-period."
-    told += [*_predicted(gains, target), *gains.warnings]
-    return [f"{remark} {' '.join(line.split())}" for line in (*told, *more) if line]
+            lines[-1] += " If it runs at another period, export again with --sample-period."
+    lines += [*_predicted(gains, target), *gains.warnings]
+    return [f"{remark} {' '.join(line.split())}" for line in (*lines, *more) if line]
 
 
 def _predicted(gains: Gains, target: Target) -> list[str]:
@@ -389,8 +389,8 @@ def _predicted(gains: Gains, target: Target) -> list[str]:
             spans = [[room / move for room in rooms] for move in moves if move]
             ends = ("down to", max(map(min, spans))), ("up to", min(map(max, spans)))
             met = [f"{how} {digits(end, 2)}" for how, end in ends if math.isfinite(end)]
-            told = f"From {target.present:.6g} u steps {' and '.join(met)} y meet no limit."
-            found += [told] * bool(met)
+            sentence = f"From {target.present:.6g} u steps {' and '.join(met)} y meet no limit."
+            found += [sentence] * bool(met)
     if gains.noise_gain * noise_std > 0.0:
         found.append(
             f"Noise of {digits(noise_std, 2)} y in the measurement makes one of "

@@ -99,9 +99,9 @@ def to_document(value: object) -> dict[str, Any]:
         elif each.kind is complex:
             found |= {"real": json_number(held.real), "imaginary": json_number(held.imag)}
         elif isinstance(held, np.ndarray):
-            told = named(value.parameters, held)  # type: ignore[attr-defined]
+            held = named(value.parameters, held)  # type: ignore[attr-defined]
             found[name] = (
-                {n: [low, told[n]] for n, low in found[name].items()} if name in found else told
+                {n: [low, held[n]] for n, low in found[name].items()} if name in found else held
             )
         elif name in found:
             found[name] = [found[name], json_number(held)]
@@ -181,10 +181,10 @@ def json_number(value: Any) -> Any:
     """Return a number as JSON has it: null if not finite, [re, im] for a complex one."""
     if isinstance(value, bool | int):
         return value
-    told = complex(value)
-    if told.imag != 0.0:
-        return [json_number(told.real), json_number(told.imag)]
-    return told.real if math.isfinite(told.real) else None
+    z = complex(value)
+    if z.imag != 0.0:
+        return [json_number(z.real), json_number(z.imag)]
+    return z.real if math.isfinite(z.real) else None
 
 
 def json_numbers(values: Iterable[complex]) -> list[Any]:
@@ -289,10 +289,10 @@ def of_message(
         if part is not None and many:
             found[each.name] = _read_columns(part, message, error, of, each.prefix)
         elif part is not None:
-            told = of_message(part, message, error, of, each.prefix)
+            nested = of_message(part, message, error, of, each.prefix)
             # A part that was not computed has a default in each of its fields.
-            absent = each.default is None and repr(told) == repr(part())
-            found[each.name] = None if absent else told
+            absent = each.default is None and repr(nested) == repr(part())
+            found[each.name] = None if absent else nested
         else:
             found[each.name] = _of_field(each, message, error, of, prefix)
     value = kind(**found)
@@ -326,7 +326,7 @@ def _shown(held: Any) -> Any:
 def _read_columns(
     kind: Any, message: Any, error: type[RelayAutotuneError], of: str, prefix: str
 ) -> tuple[Any, ...]:
-    told: dict[str, list[Any]] = {}
+    columns: dict[str, list[Any]] = {}
     first = ""
     for each in result_fields(kind):
         parts = []
@@ -337,9 +337,9 @@ def _read_columns(
             if problem is not None:
                 raise error(f"{name} {of} {problem}")
             parts.append(held)
-        told[each.name] = list(map(each.kind, *parts))
+        columns[each.name] = list(map(each.kind, *parts))
     return tuple(
-        kind(**dict(zip(told, row, strict=True))) for row in zip(*told.values(), strict=True)
+        kind(**dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)
     )
 
 

@@ -453,7 +453,7 @@ def made_visible(message: Any) -> Any:
     return message
 
 
-# Numbers of a feedback; one that cannot be is not told.
+# Numbers of a feedback; one that is impossible is not given.
 _OF_FEEDBACK = (
     Quantity("progress", 0.0, "", 0.0, 1.0),
     Quantity("elapsed", 0.0, "s", 0.0),

@@ -120,7 +120,7 @@ def _estimate_to_message(message: Any, estimate: Estimate) -> None:
 
 
 def _real(values: Sequence[complex]) -> array.array[float]:
-    # The fields hold real numbers; a complex pair is told by numerator and denominator alone.
+    # The fields hold real numbers; a complex pair is given by numerator and denominator alone.
     if any(complex(value).imag != 0.0 for value in values):
         return array.array("d")
     return array.array("d", (complex(value).real for value in values))
@@ -167,10 +167,10 @@ def _estimate_of_message(message: Any, error: type[RelayAutotuneError], of: str)
     values = structure.values_of(exact)
     found_model = structure.build(values)
     for name in ("numerator", "denominator"):
-        told, follows = list(getattr(message, name)), list(getattr(found_model, name))
-        if len(told) != len(follows) or not np.allclose(told, follows, rtol=_SAME, atol=0.0):
+        given, follows = list(getattr(message, name)), list(getattr(found_model, name))
+        if len(given) != len(follows) or not np.allclose(given, follows, rtol=_SAME, atol=0.0):
             raise error(
-                f"{name} {of} is {told}, but its gain and time constants make it {follows}: they "
+                f"{name} {of} is {given}, but its gain and time constants make it {follows}: they "
                 f"contradict each other"
             )
     return Estimate(structure, values, covariance)

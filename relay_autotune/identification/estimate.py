@@ -142,7 +142,7 @@ class Estimate:
     :param values: of its parameters, in their order, shape (p,).
     :param covariance: of the values, shape (p, p); NaN: not estimated.
     :param root: B of the covariance B B', shape (p, k), which keeps twice the digits where
-        parameters can hardly be told apart; None: not known.
+        parameters can hardly be distinguished; None: not known.
     """
 
     structure: Structure

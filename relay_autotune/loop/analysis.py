@@ -478,31 +478,31 @@ def difference(
     :param model: the process.
     """
     if does is None:
-        told = "the present gains make the loop unstable on the model"
+        sentence = "the present gains make the loop unstable on the model"
         minutes = replace(present, ti=60.0 * present.ti, td=60.0 * present.td)
         for meant, slip in (
             (replace(present, kc=-present.kc), "is the sign of kc another one"),
             (minutes, "are ti and td in minutes, not in seconds"),
         ):
             if performance_beside(meant, new, model) is not None:
-                return f"{told}; {meant} would not: {slip}?"
-        return told
+                return f"{sentence}; {meant} would not: {slip}?"
+        return sentence
     before, after = lasting_error(present, model), lasting_error(new, model)
     lasts = max(before, after) > 0.0
     if lasts:
         # An error that stays has no integral.
         kinds = ("less exact", "as exact", "more exact")
-        told = f"a lasting error of {digits(after, 3)} instead of {digits(before, 3)} y/u"
+        errors = f"a lasting error of {digits(after, 3)} instead of {digits(before, 3)} y/u"
     else:
         before, after = does.iae_load, new.iae_load
         kinds = ("slower", "as fast", "faster")
-        told = f"{after / before:.2f} times the error"
+        errors = f"{after / before:.2f} times the error"
     calm = -1 if new.ms > _MS * does.ms else int(does.ms > _MS * new.ms)
     good = -1 if after > _ERROR * before else int(after * _ERROR < before)
     joined = "but" if calm * good < 0 else "and"
     more = "; where the present loop is calm enough, ask for faster ones with a larger ms"
     return (
         f"the new gains are {('less calm', 'as calm', 'calmer')[calm + 1]} {joined} "
-        f"{kinds[good + 1]}: Ms {new.ms:.3g} instead of {does.ms:.3g}, {told} after a step of the "
-        f"load{more * (good < 0 < calm and not lasts)}"
+        f"{kinds[good + 1]}: Ms {new.ms:.3g} instead of {does.ms:.3g}, {errors} after a step of "
+        f"the load{more * (good < 0 < calm and not lasts)}"
     )

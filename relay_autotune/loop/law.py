@@ -108,7 +108,7 @@ class Running:
         return found
 
 
-# The response of a filter to an impulse has ended after so many time constants.
+# The response of a filter to an impulse has ended after this many time constants.
 _SETTLED = 12.0
 
 

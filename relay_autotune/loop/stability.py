@@ -18,7 +18,7 @@ time. A cell in which it turns by more than a radian, or a dead time does, is di
 L_k are so small at both ends that H is nearer to its limit than zero is, whatever their phases:
 there it turns around nothing. A loop of moderate Ms is that near before its dead time turns often,
 since one that turns at a magnitude near 1 passes -1. So few cells are divided of every usable
-loop, and a loop that needs far more counts as one with infinitely many zeros: it cannot be told,
+loop, and a loop that needs far more counts as one with infinitely many zeros: it is undecided,
 and nobody wants it. A loop of neutral type, whose L_k with dead time do not vanish at infinity, is
 stable only if their magnitudes there have a sum below that of the rest (Bellman and Cooke 1963).
 """
@@ -41,7 +41,7 @@ from relay_autotune.process.frequencies import frequencies
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.scalar import roots
 
-# A loop whose phase has to be followed in more cells at once cannot be told.
+# A loop whose phase has to be followed in more cells at once is undecided.
 MOST_PIECES = 20_000
 # Part of the distance of the limit of H from zero, within which H turns around nothing.
 _SURE = 0.9
@@ -223,7 +223,7 @@ _PEAKS = 4
 _ZOOMS, _ZOOM_POINTS = 9, 9
 # Accuracy of the logarithm of a frequency.
 _EXACT = 1e-13
-# Below this nothing is told of how a loop begins [rad/s], nor above its inverse of how it ends.
+# Below this nothing is known of how a loop begins [rad/s], nor above its inverse of how it ends.
 _LOWEST = 1e-280
 # Largest step of the phase that can be followed, and largest number of divisions of a cell.
 _FOLLOWED, _MOST_DIVISIONS = 1.0, 40

@@ -252,8 +252,8 @@ class Structure:
         if self.any_order:
             far = max((abs(t - lags[0]) for t in lags), default=math.inf)
             return len(lags) > 1 and not pair and far <= _EQUAL * abs(lags[0])
-        told_alike = any(f.multiplicity > 1 for f in self.factors)
-        if told_alike or len(lags) != self.order - self.integrators:
+        repeated = any(f.multiplicity > 1 for f in self.factors)
+        if repeated or len(lags) != self.order - self.integrators:
             return False
         return self.either or pair is any(f.parameters == PAIR for f in self.factors)
 

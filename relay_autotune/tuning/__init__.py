@@ -200,5 +200,5 @@ def _bare(controller: Controller, task: DesignTask) -> tuple[Performance | None,
     try:
         return task.loop(alone).performance(), ()
     except (ModelError, TuningError):
-        told = f"the loop needs the filter, tf = {controller.tf:.4g} s: without it, it is unstable"
-        return None, (told,) if controller.tf > 0.0 else ()
+        note = f"the loop needs the filter, tf = {controller.tf:.4g} s: without it, it is unstable"
+        return None, (note,) if controller.tf > 0.0 else ()

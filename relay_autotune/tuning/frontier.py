@@ -370,7 +370,7 @@ def first_crossing(distance: FloatArray, ki: FloatArray, kp: FloatArray) -> Floa
     marginal = crosses & near & ((ki[..., :-1] > 0.0) != (ki[..., 1:] > 0.0))
     at = np.where(marginal, 0.0, at)
     found = np.where(crosses & ((at > 0.0) | marginal), at, math.inf)
-    # Of a grid of one frequency, below which a sampled loop has no other, nothing is told.
+    # A grid of one frequency, below which a sampled loop has no other, gives no limit.
     return np.asarray(found.min(axis=-1, initial=math.inf))
 
 

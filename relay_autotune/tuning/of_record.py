@@ -133,12 +133,12 @@ def warned_of_rows(
     unseen = _unseen(record, options)
     if not unseen:
         return chosen
-    told = (
+    warning = (
         f"a change of the command may have come up to {digits(unseen, 3)} s before its row, "
         "since the controller is to run more often than these were written: the gains allow "
         "for as much more dead time; log faster, or add a row at each change"
     )
-    return replace(chosen, warnings=(*chosen.warnings, told))
+    return replace(chosen, warnings=(*chosen.warnings, warning))
 
 
 def sampling_period(record: Record) -> float:

@@ -16,7 +16,7 @@ it has epsilon/(K h) for zero on its right-hand side. By the first harmonic the 
 
     w D + sum of atan(w tau_i) = pi - asin(epsilon/a),   w = 2 pi/P.
 
-Which harmonics count is told by a `Wave`.
+A `Wave` says which harmonics count.
 
 The oscillation of lags under a square wave, exactly and by its first harmonic.
 
