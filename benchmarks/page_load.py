@@ -173,7 +173,7 @@ def wish(bench: Bench, url: str, what: str, phase: str) -> None:
     bench.until(lambda: page.phase, 20.0, "the page")
     page.do(what)
     # The first feedback shows that the node has accepted.
-    bench.until(lambda: page.phase == phase and page.told["state"], 20.0, what)
+    bench.until(lambda: page.phase == phase and page.snapshot["state"], 20.0, what)
     page.close()
 
 

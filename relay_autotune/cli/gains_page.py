@@ -141,7 +141,7 @@ class GainsPage:
         after = ""
         if not self.loop.proves:
             controller = self._found()
-            yield "", "now", f"{self.live.told.controller} has {self.live.told.present}"
+            yield "", "now", f"{self.live.snapshot.controller} has {self.live.snapshot.present}"
             after = "; at once, without a bump of the command"
             if message is not None:
                 controller.require_new(message)
@@ -186,8 +186,8 @@ class GainsPage:
             self._do(wish)
         except RelayAutotuneError as error:
             live.rest(str(error), good=False)
-        if live.told.window[1:] == (0.0,):
-            live.tell(window=(live.told.window[0], live.now))
+        if live.snapshot.window[1:] == (0.0,):
+            live.tell(window=(live.snapshot.window[0], live.now))
         # Limits and gains may be others at the next wish.
         self._known = None
         self.look()
@@ -205,8 +205,8 @@ class GainsPage:
         live.tell(phase="applying", tone="", status="putting the gains in force")
         controller = self._found()
         with controller.allowing(accept_doubtful=wish.doubtful):
-            told = controller.put_in_force(message)
-        live.rest(f"{told}; they are not verified", good=True, proof=())
+            sentence = controller.put_in_force(message)
+        live.rest(f"{sentence}; they are not verified", good=True, proof=())
 
     def _try(self, wish: PageCommand, message: Any) -> None:
         """Make a step that proves gains, and tell how it has ended.
@@ -239,7 +239,7 @@ class GainsPage:
             f"{what} {how_ended(result)}{left}",
             good=result.verdict == result.PASSED,
             # The proof before stays where this one was cut short.
-            proof=entries if result.steps else live.told.proof,
+            proof=entries if result.steps else live.snapshot.proof,
         )
 
     def _say(self, text: str) -> None:
@@ -261,7 +261,7 @@ class GainsPage:
             raise TuningError("there are no such gains")
         subject: PageModel = self.page.subjects[wish.of]
         if subject.loop != self.number:
-            raise TuningError(f"the gains are for another loop than {self.live.told.node}")
+            raise TuningError(f"the gains are for another loop than {self.live.snapshot.node}")
         work = self.page.worker.ask(partial(subject.shaped, wish.asked))
         shaped = self.loop.client.computed(work, self.leave)
         gains, judgement = shaped.gains, shaped.judgement

@@ -29,7 +29,7 @@ from relay_autotune.cli.own_nodes import PROGRAM
 from relay_autotune.cli.report import flags_of
 from relay_autotune.cli.settings import NAMES
 from relay_autotune.cli.terminal import UNITS
-from relay_autotune.cli.tune_view import STATES, Paint, Shown, check_parts, told_of
+from relay_autotune.cli.tune_view import STATES, Paint, Shown, check_parts, cycle_line
 from relay_autotune.cli.tuned import Tuned
 from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError
 from relay_autotune.exchange.messages import (
@@ -202,15 +202,15 @@ class _LoopOnPage:
         if wish.settings:
             self._loop.set(dict(wish.settings))
         if lacking := self._loop.lacking():
-            told = "; ".join(lacking)
-            raise SelectionError(f"fill in the plan first (Start a tune): {told}")
+            missing = "; ".join(lacking)
+            raise SelectionError(f"fill in the plan first (Start a tune): {missing}")
         self._loop.before_tune()
         self._live.tell(limits=tuple(self._options.within or ()))
 
     def _tune(self, wish: PageCommand) -> int | None:
         """Tune until the result is there; return its exit status, None: it was not asked for."""
         client, live = self._client, self._live
-        before = live.told
+        before = live.snapshot
         try:
             self._take(wish)
         except RelayAutotuneError as error:
@@ -231,8 +231,8 @@ class _LoopOnPage:
             self._at_first = lambda: stack.enter_context(self._commands_shown())
             self._loop.tune(self, self._ends, tick=_TICK)
             self._terminal.clear()
-        if not live.told.window[1]:
-            live.tell(window=(live.told.window[0], live.now))
+        if not live.snapshot.window[1]:
+            live.tell(window=(live.snapshot.window[0], live.now))
         tune = Tuned(self._loop)
         result = tune.result
         for refused in sorted(client.refused):
@@ -251,7 +251,7 @@ class _LoopOnPage:
         )
         if result.transfer_function.experiment_id:
             # A short tune ends before any model came.
-            cycles = len(live.told.cycles)
+            cycles = len(live.snapshot.cycles)
             live.tell(process=self._show(result.transfer_function, cycles))
             self._add_subject(tune)
         if tune.has_gains:
@@ -271,8 +271,8 @@ class _LoopOnPage:
         if self._at_first is not None:
             self._at_first()
             self._at_first = None
-        told, state = self._live.told, STATES[feedback.state]
-        begun, ended = told.window
+        snapshot, state = self._live.snapshot, STATES[feedback.state]
+        begun, ended = snapshot.window
         if state in _TONES and not ended:
             ended = self._live.now
         changed: dict[str, Any] = {
@@ -284,9 +284,9 @@ class _LoopOnPage:
             "elapsed": feedback.elapsed,
             "remaining": feedback.remaining,
         }
-        if feedback.cycle > len(told.cycles):
-            line = told_of(f"cycle {feedback.cycle}", feedback)
-            changed["cycles"] = (*told.cycles, line)
+        if feedback.cycle > len(snapshot.cycles):
+            line = cycle_line(f"cycle {feedback.cycle}", feedback)
+            changed["cycles"] = (*snapshot.cycles, line)
         if feedback.transfer_function.experiment_id:
             changed["process"] = self._show(feedback.transfer_function, feedback.cycle)
         self._live.tell(**changed)
@@ -360,7 +360,7 @@ class _LoopOnPage:
             command,
             self._number,
             self._loop.target,
-            self._live.told.began,
+            self._live.snapshot.began,
         )
         self._live.tell(tuned=self._page.add(subject))
 

@@ -102,7 +102,7 @@ def oscillation(feedback: Any) -> str:
     return text
 
 
-def told_of(begins: str, feedback: Any) -> str:
+def cycle_line(begins: str, feedback: Any) -> str:
     """Return the last whole cycle and what is known after it, as far as they are there.
 
     :param begins: the first words.
@@ -120,9 +120,9 @@ def log_line(feedback: Any, before: Any = None) -> str:
     state = STATES[feedback.state]
     told = feedback.status or state
     if state == "completed" and (before is None or before.state != feedback.state):
-        told = told_of(state, feedback)
+        told = cycle_line(state, feedback)
     elif feedback.cycle and (before is None or before.cycle != feedback.cycle):
-        told = told_of(f"cycle {feedback.cycle}", feedback)
+        told = cycle_line(f"cycle {feedback.cycle}", feedback)
         if math.isfinite(feedback.remaining) and feedback.remaining > 0.0:
             told += f", about {duration(feedback.remaining)} left"
     return f"{feedback.elapsed:8.1f} s  {told}"

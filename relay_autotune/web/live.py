@@ -3,8 +3,8 @@
 
 """A tune as pages see it while it runs: samples as they come, its state in words, what is wished.
 
-One thread tells what happens, another serves the pages. What is told is kept, so that a page that
-is opened late or loaded again shows all. Without any page nothing waits and nothing changes.
+One thread reports what happens, another serves the pages. It is all kept, so that a page that is
+opened late or loaded again shows all. Without any page nothing waits and nothing changes.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class PageCommand:
 
 @dataclass(frozen=True)
 class PagePlan:
-    """What a wish would do, as it is told before anything moves.
+    """What a wish would do, as said before anything moves.
 
     :param number: of the question.
     :param refusal: why it cannot be done; empty: it can.
@@ -82,7 +82,7 @@ class PagePlan:
 
 
 @dataclass(frozen=True)
-class Told:
+class Snapshot:
     """What is known of the tune besides its samples.
 
     :param node: name of the loop.
@@ -151,8 +151,8 @@ class Live:
 
     def __init__(self, node: str) -> None:
         self._lock = threading.Lock()
-        self._told = Told(node)
-        self._known: Told | None = None
+        self._snapshot = Snapshot(node)
+        self._sent: Snapshot | None = None
         self._signals = {"measurement": _Signal(), "command": _Signal()}
         self._begun = time.monotonic()
         self._wishes: deque[PageCommand] = deque()
@@ -163,24 +163,24 @@ class Live:
         """Whether a page wishes that the tune, or the verification, ends."""
 
     @property
-    def told(self) -> Told:
+    def snapshot(self) -> Snapshot:
         """What is known now."""
-        return self._told
+        return self._snapshot
 
     def tell(self, **changed: Any) -> None:
         """Change what is known.
 
-        :param changed: fields of `Told`.
+        :param changed: fields of `Snapshot`.
         """
         with self._lock:
-            self._told = replace(self._told, **changed)
+            self._snapshot = replace(self._snapshot, **changed)
 
     def rest(self, status: str, *, good: bool, **changed: Any) -> None:
         """Tell that nothing is done any more, and how the last thing went.
 
         :param status: a sentence.
         :param good: whether it went well.
-        :param changed: other fields of `Told`.
+        :param changed: other fields of `Snapshot`.
         """
         self._taken = None
         self.tell(phase="idle", status=status, tone="good" if good else "bad", **changed)
@@ -224,7 +224,7 @@ class Live:
             return ""
         with self._lock:
             agreed = any(each and not each.dry for each in (self._taken, *self._wishes))
-            waits = self._told.phase in ("idle", "checking", "applying")
+            waits = self._snapshot.phase in ("idle", "checking", "applying")
             if waits and (wish.dry or not agreed):
                 self._wishes.append(wish)
             elif not wish.dry:
@@ -247,7 +247,7 @@ class Live:
     def everything(self) -> dict[str, Any]:
         """Return what a page shows that has just been opened."""
         with self._lock:
-            told = _document(self._told)
+            snapshot = _document(self._snapshot)
             shown = dict(self._shown)
             kept = {
                 name: np.array(signal.kept).reshape(-1, 2).T
@@ -258,15 +258,15 @@ class Live:
         if command.size > 1:
             held, command = in_steps(held, command)
         found = {"measurement": curve(at, measurement), "command": curve(held, command)}
-        return {"live": told, "samples": found, "shown": shown, "all": True}
+        return {"live": snapshot, "samples": found, "shown": shown, "all": True}
 
     def news(self) -> dict[str, Any] | None:
-        """Return what pages have not been told yet; None: nothing."""
+        """Return what pages do not have yet; None: nothing."""
         with self._lock:
             news: dict[str, Any] = {}
-            if self._known != self._told:
-                news["live"] = _document(self._told)
-                self._known = self._told
+            if self._sent != self._snapshot:
+                news["live"] = _document(self._snapshot)
+                self._sent = self._snapshot
             if self._shown_anew:
                 news["shown"] = {name: self._shown[name] for name in self._shown_anew}
                 self._shown_anew.clear()
@@ -280,9 +280,9 @@ class Live:
         return news or None
 
 
-def _document(told: Told) -> dict[str, Any]:
+def _document(snapshot: Snapshot) -> dict[str, Any]:
     """Return what is known as JSON has it: None stands for a number that is not known."""
     return {
         name: json_number(value) if isinstance(value, float) else value
-        for name, value in asdict(told).items()
+        for name, value in asdict(snapshot).items()
     }

@@ -119,7 +119,7 @@ class Page:
     def _next_ahead(self) -> Callable[[], object] | None:
         """Return what to compute ahead: what the slider can ask for next, once somebody asked."""
         # relay_node needs the processor while a tune runs.
-        if any(live.told.phase != "idle" for live in self.lives):
+        if any(live.snapshot.phase != "idle" for live in self.lives):
             return None
         for number, last in list(self._last.items()):
             for asked in self.subjects[number].positions(last):
@@ -178,12 +178,12 @@ class Page:
         try:
             shaped = subject.shaped(asked)
             exports = {"exports": list(exports_of(shaped.gains.law))}
-            told = wire.to_text({"shaped": wire.of_shaped(subject, shaped) | exports})
+            answer = wire.to_text({"shaped": wire.of_shaped(subject, shaped) | exports})
         except RelayAutotuneError as error:
-            told = _refused(error)
+            answer = _refused(error)
         except Exception as error:  # noqa: BLE001  a defect must not leave the page waiting
-            told = wire.to_text({"refused": defect(error)})
-        return self.keep(number, asked, told)
+            answer = wire.to_text({"refused": defect(error)})
+        return self.keep(number, asked, answer)
 
     def keep(self, number: int, asked: DesignRequest, answer: str) -> str:
         """Keep the answer to what a page asks, and return it.
@@ -352,12 +352,12 @@ class _Export(_Guarded):
 
 
 class _Socket(_Guarded, WebSocketHandler):
-    """What one open page asks, and what it is told."""
+    """What one open page asks, and what it is sent."""
 
     def open(self, *_: str, **__: str) -> None:
         """Tell the page everything, and from then on what is new."""
         self.set_nodelay(True)
-        self._told: dict[int, tuple[DesignRequest, int]] = {}
+        self._sent: dict[int, tuple[DesignRequest, int]] = {}
         self._asked: dict[int, DesignRequest] = {}
         self._waits: asyncio.Task[None] | None = None
         self._shown = 0
@@ -459,8 +459,8 @@ class _Socket(_Guarded, WebSocketHandler):
         for number, subject in enumerate(self.page.subjects):
             asked = self._asked.get(number, subject.first).apart_from_ms
             known = wire.of_trade_off(subject, asked)
-            if (asked, len(known)) != self._told.get(number):
-                self._told[number] = asked, len(known)
+            if (asked, len(known)) != self._sent.get(number):
+                self._sent[number] = asked, len(known)
                 self.tell(wire.to_text({"of": number, "trade_off": known}))
 
 

@@ -455,7 +455,7 @@ def test_the_page_refuses_a_step_beyond_the_limits_before_anything_changes() -> 
         assert "is -1.6 y, expected from -1.5 to 2 y" in refused.refusal
         assert refused.refused == "step"
         page.do(PageCommand(what, step=-1.6))
-        assert live.told.status == refused.refusal
+        assert live.snapshot.status == refused.refusal
         # the usual one is as high as allowed, and stands in the field
         usual = page.plan(PageCommand(what, dry=2))
         assert (usual.refusal, usual.form[0]["values"]) == ("", [2.0])
@@ -469,10 +469,10 @@ def test_the_page_refuses_a_step_beyond_the_limits_before_anything_changes() -> 
     # what takes them back is a button of the page, not another command
     controller.prove = lambda *words: Verify.Result(verdict=Verify.Result.PASSED, steps=[step()])
     page.do(PageCommand(VERIFY, step=1.0))
-    assert live.told.proof[-1] == ("gains in force", "kc 0.1000, ti 3.000, td 0")
+    assert live.snapshot.proof[-1] == ("gains in force", "kc 0.1000, ti 3.000, td 0")
     controller.prove = lambda *words: Verify.Result(reason="a tune has begun")
     page.do(PageCommand(VERIFY, step=1.0))
-    assert live.told.status == "verification ended without a verdict: a tune has begun"
+    assert live.snapshot.status == "verification ended without a verdict: a tune has begun"
 
 
 def test_a_command_line_that_does_not_fit_ends_with_two() -> None:

@@ -646,15 +646,19 @@ def test_a_plan_says_what_is_missing_or_which_answer_cannot_be_and_leaves_the_st
     shown: Any = _LoopOnPage.__new__(_LoopOnPage)
     shown._loop, shown._live, shown._client, shown._options = loop, live, client, loop.options
     shown._show_plan(PageCommand("start", dry=7))
-    plan = live.told.plan
+    plan = live.snapshot.plan
     assert "present command" in plan.refusal and "command of the actuator" in plan.refusal
     assert "measurement" not in plan.refusal and (plan.number, plan.refused) == (7, "")
     assert [row["values"] for row in plan.form] == [[None], [30.0, 50.0], None, [0.0]]
     answers = {"at": 2, "within": [50, 60], "command_within": [0, 5]}
     shown._show_plan(PageCommand("start", dry=8, settings=answers))
-    assert (live.told.plan.number, live.told.plan.refused) == (8, "within")
-    assert "the measurement is 44 now: give limits around it" in live.told.plan.refusal
-    assert (live.told.phase, live.told.status, live.told.tone) == ("idle", "proof passed", "good")
+    assert (live.snapshot.plan.number, live.snapshot.plan.refused) == (8, "within")
+    assert "the measurement is 44 now: give limits around it" in live.snapshot.plan.refusal
+    assert (live.snapshot.phase, live.snapshot.status, live.snapshot.tone) == (
+        "idle",
+        "proof passed",
+        "good",
+    )
     # A given amplitude is not searched for between the limits of the command.
     loop.options.amplitude, loop.options.at = 1.0, 2.0
     assert loop.lacking() == []
@@ -678,7 +682,7 @@ def test_a_plan_that_relay_node_refuses_marks_the_answer_to_change() -> None:
     shown._loop, shown._client, shown._options = loop, client, loop.options
     shown._live = Live("tank")
     shown._show_plan(PageCommand("start", dry=7))
-    plan = shown._live.told.plan
+    plan = shown._live.snapshot.plan
     assert plan.refusal.startswith("refused: ") and plan.refused == "at"
     assert [line[:2] for line in plan.lines] == [("note", "limits"), ("NO", "levels")]
 

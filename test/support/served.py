@@ -119,8 +119,8 @@ class OpenPage:
     def __init__(self, url: str, loop: int = 0) -> None:
         self._number = loop
         self._address = url.replace("http:", "ws:", 1) + "socket"
-        self.told: dict[str, Any] = {}
-        """What it was told last of the loop."""
+        self.snapshot: dict[str, Any] = {}
+        """What it received last of the loop."""
         self.shown: dict[str, Any] = {}
         """The figures that change seldom, by name."""
         self.samples: dict[str, list[float]] = {"measurement": [], "command": []}
@@ -141,7 +141,7 @@ class OpenPage:
             message = json.loads(text)
             if message.get("loop", self._number) != self._number:
                 continue
-            self.told = message.get("live", self.told)
+            self.snapshot = message.get("live", self.snapshot)
             self.shown |= message.get("shown", {})
             self.subjects = message.get("subjects", self.subjects)
             for name, (_, values) in message.get("samples", {}).items():
@@ -151,7 +151,7 @@ class OpenPage:
     @property
     def phase(self) -> str:
         """What the page says is going on."""
-        return str(self.told.get("phase", ""))
+        return str(self.snapshot.get("phase", ""))
 
     def do(self, wish: str, **more: Any) -> None:
         """Wish something."""

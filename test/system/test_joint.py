@@ -59,25 +59,25 @@ def test_a_joint_is_tuned_on_a_page_which_verifies_gains_between_two_tunes(rig: 
     page = OpenPage(found[1])
 
     def accepted() -> bool:
-        count = page.told["checked"]
+        count = page.snapshot["checked"]
         page.do("check")
-        rig.until(lambda: page.told["checked"] > count and page.phase == "idle", "a check")
-        return bool(page.told["accepted"])
+        rig.until(lambda: page.snapshot["checked"] > count and page.phase == "idle", "a check")
+        return bool(page.snapshot["accepted"])
 
-    rig.until(lambda: page.told.get("form"), "the form")
-    assert [row["name"] for row in page.told["form"]] == ["within", "amplitude"]
+    rig.until(lambda: page.snapshot.get("form"), "the form")
+    assert [row["name"] for row in page.snapshot["form"]] == ["within", "amplitude"]
     rig.until(accepted, "a check that accepts", 60.0)
-    told = {name: found for _, name, found in page.told["checks"]}
+    told = {name: found for _, name, found in page.snapshot["checks"]}
     assert told["moves"].startswith("the reference of left_wheel about")
     page.do("start")
-    rig.until(lambda: page.told["status"] == "the tune is complete", "the tune", 240.0)
+    rig.until(lambda: page.snapshot["status"] == "the tune is complete", "the tune", 240.0)
     assert robot.gains() == before
-    rig.until(lambda: page.told["controller"].endswith("/controller_node"), "it", 60.0)
-    rig.until(lambda: page.told["step"], "the usual step")
+    rig.until(lambda: page.snapshot["controller"].endswith("/controller_node"), "it", 60.0)
+    rig.until(lambda: page.snapshot["step"], "the usual step")
     asked = page.subjects[0]["first"]
-    page.do("apply", of=0, asked=asked, step=page.told["step"], accept_doubtful=True)
-    rig.until(lambda: "verification" in page.told["status"], "the verification", 120.0)
-    assert page.told["status"].startswith("verification passed"), page.told["status"]
+    page.do("apply", of=0, asked=asked, step=page.snapshot["step"], accept_doubtful=True)
+    rig.until(lambda: "verification" in page.snapshot["status"], "the verification", 120.0)
+    assert page.snapshot["status"].startswith("verification passed"), page.snapshot["status"]
     assert robot.gains() != before
     # It makes way for the next tune.
     rig.until(accepted, "a second check that accepts", 60.0)

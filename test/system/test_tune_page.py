@@ -42,15 +42,15 @@ def accepted(rig: Rig, page: OpenPage) -> None:
     """Check until a tune could start; right after the start nodes have not found each other."""
 
     def checked() -> bool:
-        number = page.told["plan"]["number"] + 1
+        number = page.snapshot["plan"]["number"] + 1
         page.do("start", dry=number)
         # A second wish on its way would be a second check, during which no tune can be started.
         rig.until(
-            lambda: page.told["plan"]["number"] == number and page.phase == "idle", "a check"
+            lambda: page.snapshot["plan"]["number"] == number and page.phase == "idle", "a check"
         )
-        return not page.told["plan"]["refusal"]
+        return not page.snapshot["plan"]["refusal"]
 
-    rig.until(lambda: page.told, "what is known")
+    rig.until(lambda: page.snapshot, "what is known")
     rig.until(checked, "a check that accepts")
 
 
@@ -66,24 +66,25 @@ def test_a_tune_is_ended_on_any_page_in_each_state_and_a_closed_one_changes_noth
     first.do("start")
     rig.until(lambda: any(m.data != 1.0 for m in commands), "a step")
     first.close()
-    seen = second.told["elapsed"]
-    rig.until(lambda: second.told["elapsed"] > seen + 1.0, "a tune that goes on")
+    seen = second.snapshot["elapsed"]
+    rig.until(lambda: second.snapshot["elapsed"] > seen + 1.0, "a tune that goes on")
     late = OpenPage(url)
     # The test begins with a quarter of the amplitude.
     rig.until(
-        lambda: late.told and any(u != 1.0 for u in late.samples["command"]), "all that was before"
+        lambda: late.snapshot and any(u != 1.0 for u in late.samples["command"]),
+        "all that was before",
     )
-    assert late.told["status"]
-    assert late.told["node"] == "/tank/relay_node"
+    assert late.snapshot["status"]
+    assert late.snapshot["node"] == "/tank/relay_node"
     late.do("abort")
     rig.until(lambda: second.phase == "idle", "the end")
     rig.until(lambda: commands[-1].data == 1.0, "the safe command")
-    assert second.told["result"][0].strip().startswith("tune")
-    assert "cancelled" in second.told["result"][0]
+    assert second.snapshot["result"][0].strip().startswith("tune")
+    assert "cancelled" in second.snapshot["result"][0]
     assert second.subjects == []
     # in the midst of settling
     late.do("start")
-    rig.until(lambda: late.phase == "tuning" and late.told["state"] == "settling", "settling")
+    rig.until(lambda: late.phase == "tuning" and late.snapshot["state"] == "settling", "settling")
     second.do("abort")
     rig.until(lambda: late.phase == "idle", "the second end")
     rig.until(lambda: commands[-1].data == 1.0, "the safe command of the second")
@@ -109,7 +110,7 @@ def test_an_open_page_does_not_count_as_somebody_who_hears_the_command(rig: Rig)
         # Until relay_node has found the sensor, it refuses for that.
         page.do("start")
         rig.run_for(0.5)
-        return "no command would arrive" in page.told.get("status", "")
+        return "no command would arrive" in page.snapshot.get("status", "")
 
     rig.until(is_refused, "the refusal")
     assert page.phase == "idle"
@@ -134,7 +135,7 @@ def test_two_loops_of_a_page_are_tuned_at_once_and_ended_apart(rig: Rig) -> None
     pages["oven"].do("abort")
     rig.until(lambda: pages["oven"].phase == "idle", "the end of one")
     rig.until(lambda: commands["oven"][-1].data == 1.0, "the safe command of the oven")
-    assert pages["oven"].told["node"] == "/oven/relay_node"
+    assert pages["oven"].snapshot["node"] == "/oven/relay_node"
     assert pages["tank"].phase == "tuning"
     # Ctrl-C ends the other one, then the command
     command.signal(signal.SIGINT)
@@ -261,7 +262,7 @@ def test_after_a_failed_tune_the_page_says_how_the_plant_is_left_and_shows_what_
     page.do("start")
     rig.until(lambda: page.phase == "tuning", "a tune")
     rig.until(lambda: page.phase == "idle", "its end")
-    assert "the command stands at 0 u, which is not the one" in page.told["status"]
-    assert page.told["window"] == []
+    assert "the command stands at 0 u, which is not the one" in page.snapshot["status"]
+    assert page.snapshot["window"] == []
     command.signal(signal.SIGINT)
     assert command.wait() == 1

@@ -108,10 +108,10 @@ def test_a_proof_that_is_refused_leaves_the_one_that_has_passed():
     # no tune has left a model on which the step could be predicted
     plan = gains.plan(replace(CALM, what="prove", dry=1))
     assert "no gains of a tune" in plan.refusal and not plan.refused
-    assert live.told.status == "proof passed"
+    assert live.snapshot.status == "proof passed"
     gains.do(replace(CALM, what="prove"))
-    assert "no gains of a tune" in live.told.status
-    assert live.told.proof == passed and live.everything()["shown"] == {"proof": [1]}
+    assert "no gains of a tune" in live.snapshot.status
+    assert live.snapshot.proof == passed and live.everything()["shown"] == {"proof": [1]}
 
 
 def test_a_proof_is_in_the_report_of_its_gains_and_is_computed_once(monkeypatch):
@@ -151,7 +151,7 @@ def test_a_proof_is_in_the_report_of_its_gains_and_is_computed_once(monkeypatch)
     gains.do(replace(wish, step=-0.7))
     # computed once, for two plans and the proof itself
     assert (asked, len(computed)) == ([-0.7], 1)
-    assert live.told.status.startswith("proof passed")
+    assert live.snapshot.status.startswith("proof passed")
     names = dict(subject.case.proof)
     assert names["gains"] == "kc 0.5"
-    assert names["verdict"].startswith("passed") and subject.case.proof == live.told.proof
+    assert names["verdict"].startswith("passed") and subject.case.proof == live.snapshot.proof

@@ -84,12 +84,12 @@ function reach(values, limits, lines) {
 class Loop {
   constructor(number) {
     this.number = number;
-    this.told = null;
+    this.snapshot = null;
     this.shown = {};
     this.signals = { measurement: new Signal(), command: new Signal() };
   }
 
-  get phase() { return this.told ? this.told.phase : ""; }
+  get phase() { return this.snapshot ? this.snapshot.phase : ""; }
 
   get running() { return this.phase === "tuning" || this.phase === "verifying"; }
 
@@ -125,13 +125,13 @@ export class Live {
       measurement: new Plot($("plot-live-measurement"), { label: "Measurement as it comes", y: "measurement [y]" }),
       command: new Plot($("plot-live-command"), { label: "Command as it comes", x: "time [s]", y: "command [u]" }),
     };
-    $("start").addEventListener("click", () => this.begin("start", `Tune ${this.told.node}`, "Start the tune"));
+    $("start").addEventListener("click", () => this.begin("start", `Tune ${this.snapshot.node}`, "Start the tune"));
     $("abort").addEventListener("click", () => this.send("abort"));
     this.model = new Plot($("plot-so-far"), { label: "Measurement so far, and the model", x: "time [s]", y: "measurement [y]" });
     this.ultimate = new Plot($("plot-ku"), { label: "K_u after each cycle with its 95 % interval", x: "cycles", y: "K_u [u/y]" });
     this.proof = new Plot($("plot-proof"), { label: "Verification: measured and predicted", x: "time [s]", y: "measurement [y]" });
     $("prove").addEventListener("click", () => {
-      const words = this.told.controller ? "Apply and verify" : "Prove the gains";
+      const words = this.snapshot.controller ? "Apply and verify" : "Prove the gains";
       this.begin("prove", words, words);
     });
     $("apply").addEventListener("click", () => this.begin("apply", "Apply without a step", "Apply"));
@@ -140,12 +140,12 @@ export class Live {
     document.addEventListener("visibilitychange", () => this.drawSoon());
   }
 
-  get told() { return this.loop.told; }
+  get snapshot() { return this.loop.snapshot; }
 
   get signals() { return this.loop.signals; }
 
   send(what, more, loop = this.loop) {
-    // What comes of it is told at the top.
+    // What comes of it is said at the top.
     window.scrollTo(0, 0);
     this.wish(what, { loop: loop.number, ...more });
   }
@@ -157,8 +157,8 @@ export class Live {
     this.loop ||= loop;
     loop.take(message);
     if (message.live) {
-      const before = loop.told;
-      loop.told = message.live;
+      const before = loop.snapshot;
+      loop.snapshot = message.live;
       this.showLoops();
       // A plan must not stand before what ends a tune.
       if (loop.running && !(before && before.phase === loop.phase)) this.plan.close();
@@ -205,15 +205,15 @@ export class Live {
   showLoops() {
     const host = $("loops");
     host.hidden = this.loops.length < 2;
-    const words = JSON.stringify([this.loop.number, this.loops.map((each) => [each.told && each.told.node, each.phase])]);
+    const words = JSON.stringify([this.loop.number, this.loops.map((each) => [each.snapshot && each.snapshot.node, each.phase])]);
     if (host.hidden || this.words === words) return;
     this.words = words;
     host.replaceChildren();
-    for (const loop of this.loops.filter((each) => each && each.told)) {
-      const tab = button(host, `${loop.told.node}: ${loop.phase}`, () => this.choose(loop));
+    for (const loop of this.loops.filter((each) => each && each.snapshot)) {
+      const tab = button(host, `${loop.snapshot.node}: ${loop.phase}`, () => this.choose(loop));
       tab.setAttribute("aria-pressed", String(loop === this.loop));
       if (loop.running && loop !== this.loop) {
-        button(host, `Abort ${loop.told.node}`, () => this.send("abort", {}, loop)).className = "stop";
+        button(host, `Abort ${loop.snapshot.node}`, () => this.send("abort", {}, loop)).className = "stop";
       }
     }
   }
@@ -223,7 +223,7 @@ export class Live {
     const known = [measurement, command].filter((each) => each.count);
     if (!known.length) return;
     const last = Math.max(...known.map((each) => each.last));
-    const { setpoint, hysteresis, limits = [], levels = [], window: tuned = [] } = this.told || {};
+    const { setpoint, hysteresis, limits = [], levels = [], window: tuned = [] } = this.snapshot || {};
     const [from, to] = tuned;
     // The last tune with a little before it, else the last minute.
     const first = Math.min(...known.map((each) => each.first));
@@ -258,48 +258,48 @@ export class Live {
   }
 
   show() {
-    const told = this.told;
+    const snapshot = this.snapshot;
     $("live").hidden = false;
     $("live-bar").hidden = !this.loop.running;
-    const tuning = told.phase === "tuning";
-    const state = tuning ? told.state || "asked" : told.phase === "idle" ? IDLE[told.tone] : told.phase;
+    const tuning = snapshot.phase === "tuning";
+    const state = tuning ? snapshot.state || "asked" : snapshot.phase === "idle" ? IDLE[snapshot.tone] : snapshot.phase;
     if ($("live-state").textContent !== state) $("live-state").textContent = state;
-    $("live-state").className = `chip ${told.tone || TONES[told.state] || ""}`;
-    $("live-status").textContent = told.status;
+    $("live-state").className = `chip ${snapshot.tone || TONES[snapshot.state] || ""}`;
+    $("live-status").textContent = snapshot.status;
     $("abort").disabled = !this.loop.running;
-    $("abort").textContent = told.phase === "verifying" ? "End the verification" : "Abort the tune";
-    $("start").disabled = told.phase !== "idle";
+    $("abort").textContent = snapshot.phase === "verifying" ? "End the verification" : "Abort the tune";
+    $("start").disabled = snapshot.phase !== "idle";
     $("start").parentElement.hidden = this.loop.running;
     $("abort").hidden = !this.loop.running;
     $("progress").hidden = !tuning;
-    $("progress").value = told.progress || 0;
-    const left = told.remaining > 0 ? `, about ${told.remaining.toFixed(0)} s left` : "";
-    $("live-times").textContent = tuning ? `${told.elapsed.toFixed(0)} s so far${left}` : "";
+    $("progress").value = snapshot.progress || 0;
+    const left = snapshot.remaining > 0 ? `, about ${snapshot.remaining.toFixed(0)} s left` : "";
+    $("live-times").textContent = tuning ? `${snapshot.elapsed.toFixed(0)} s so far${left}` : "";
     const cycles = $("live-cycles");
-    if (cycles.children.length !== told.cycles.length) {
+    if (cycles.children.length !== snapshot.cycles.length) {
       cycles.replaceChildren();
-      for (const line of told.cycles) put(cycles, "li", line);
+      for (const line of snapshot.cycles) put(cycles, "li", line);
     }
-    $("live-process").textContent = told.process;
+    $("live-process").textContent = snapshot.process;
     this.showPlan();
-    $("result-box").hidden = !told.result.length;
-    $("live-result").textContent = told.result.join("\n");
-    document.body.dataset.phase = told.phase;
-    const runs = Boolean(told.controller);
-    $("force").hidden = tuning || !(runs || told.proves);
+    $("result-box").hidden = !snapshot.result.length;
+    $("live-result").textContent = snapshot.result.join("\n");
+    document.body.dataset.phase = snapshot.phase;
+    const runs = Boolean(snapshot.controller);
+    $("force").hidden = tuning || !(runs || snapshot.proves);
     $("force-title").textContent = runs ? "The running controller" : "Prove the gains";
     for (const id of ["apply", "verify", "revert"]) $(id).hidden = !runs;
     $("prove").textContent = runs ? "Apply and verify" : "Prove with a step";
-    table($("force-proof"), told.proof, ["", "text"]);
+    table($("force-proof"), snapshot.proof, ["", "text"]);
     // The figure of a proof goes with its words: other gains have come since.
-    $("proof").hidden = !(told.proof.length && (this.loop.shown.proof || []).length);
+    $("proof").hidden = !(snapshot.proof.length && (this.loop.shown.proof || []).length);
     this.showForce();
   }
 
   // The gains of the page beside those of the running controller, and what may be done.
   showForce() {
-    if (!(this.loop && this.told && (this.told.controller || this.told.proves))) return;
-    const { controller, present, phase } = this.told;
+    if (!(this.loop && this.snapshot && (this.snapshot.controller || this.snapshot.proves))) return;
+    const { controller, present, phase } = this.snapshot;
     const new_ = this.offered();
     $("force-now").textContent = controller ? `${controller} has ${present}` : "Nobody else controls this loop: a controller of this command makes one step, and ends.";
     $("force-new").textContent = new_ ? `${controller ? "To apply" : "To prove"}: ${new_.words}${new_.doubtful ? ", which are doubtful" : ""}.` : "The page shows no gains that could be applied.";
@@ -328,7 +328,7 @@ export class Live {
   }
 
   showProof(steps) {
-    $("proof").hidden = !(this.told.proof.length && steps.length);
+    $("proof").hidden = !(this.snapshot.proof.length && steps.length);
     if (!steps.length) return;
     const [step] = steps;
     this.proof.draw({
@@ -346,15 +346,15 @@ export class Live {
     this.question = 0;
     this.plan.begin(title, yes + (doubtful ? ", though they are doubtful" : ""), (typed) => this.send(what, words(typed), loop), (typed) => {
       this.question = 1 + Math.floor(Math.random() * 2 ** 52);
-      this.seen = this.told.plan.number;
+      this.seen = this.snapshot.plan.number;
       // What is looked at now is of other answers, or of another page.
-      this.again = this.told.phase !== "idle";
+      this.again = this.snapshot.phase !== "idle";
       if (!this.again) this.wish(what, { loop: loop.number, ...words(typed), dry: this.question });
     });
   }
 
   showPlan() {
-    const { phase, plan } = this.told;
+    const { phase, plan } = this.snapshot;
     if (!this.plan.open || phase !== "idle" || !this.question) return;
     if (plan.number === this.question) {
       this.question = 0;

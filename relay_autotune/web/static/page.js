@@ -238,7 +238,7 @@ function showRefused(text) {
 
 function showSubject() {
   const subject = subjects[chosen];
-  const name = live ? live.told.node : subject.name;
+  const name = live ? live.snapshot.node : subject.name;
   $("name").textContent = name;
   document.title = `${name} - relay_autotune`;
   $("facts").replaceChildren();
@@ -272,9 +272,9 @@ function showSubject() {
 // Which tune the gains are of: after one without gains those before stay.
 function showOf() {
   const { when } = subjects[chosen];
-  const none = Boolean(when) && live.told.tuned < 0;
+  const none = Boolean(when) && live.snapshot.tuned < 0;
   document.body.classList.toggle("old", none);
-  const last = none && live.told.phase === "idle" ? `; the last tune, at ${live.told.began}, gave none` : "";
+  const last = none && live.snapshot.phase === "idle" ? `; the last tune, at ${live.snapshot.began}, gave none` : "";
   $("gains-of").textContent = when ? `of the tune at ${when}${last}` : "";
 }
 
@@ -332,8 +332,8 @@ function showLoop() {
   if (k >= 0) { choose(k); return; }
   chosen = -1;
   shaped = null;
-  $("name").textContent = live.told.node;
-  document.title = `${live.told.node} - relay_autotune`;
+  $("name").textContent = live.snapshot.node;
+  document.title = `${live.snapshot.node} - relay_autotune`;
   $("facts").replaceChildren();
   $("gains").textContent = $("verdict").textContent = "";
   $("notes").hidden = true;
