@@ -158,9 +158,9 @@ class AfterTune(Tuned):
         steps = loop.again(prefix() + again)
         if result.why.code == Code.SILENT_SENSOR:
             why = reason_from_message(result.why)
-            told = f"the sensor of {why['topic']} (--dry-run tells its rate) and the load (uptime)"
+            what = f"the sensor of {why['topic']} (--dry-run tells its rate) and the load (uptime)"
             wait = f"for a longer silence {loop.to_type(why)}"
-            steps.append(("if it happens again", f"look at {told}; {wait}"))
+            steps.append(("if it happens again", f"look at {what}; {wait}"))
         return steps
 
     # The report.
@@ -171,8 +171,8 @@ class AfterTune(Tuned):
         if client.cancelled:
             # Who ends it waits for nothing more that takes long.
             if options.report:
-                told = f"no report: the tune was cancelled; {prefix()}report makes one"
-                say(PROGRAM, f"{told} of {result.bag}" if result.bag else told)
+                sentence = f"no report: the tune was cancelled; {prefix()}report makes one"
+                say(PROGRAM, f"{sentence} of {result.bag}" if result.bag else sentence)
             return "", ""
         # Imported here, because it loads slowly.
         from relay_autotune.cli.report import flags_of
@@ -184,12 +184,12 @@ class AfterTune(Tuned):
             if self.asked_there is None:
                 say(PROGRAM, "no identifier_node answers: the report uses its default parameters")
             with Working("writing the report"):
-                told = self._write_report(flags)
+                sentence = self._write_report(flags)
         except RelayAutotuneError as error:
             say(PROGRAM, f"no report: {error}")
             return flags, ""
-        if told:
-            say(PROGRAM, told)
+        if sentence:
+            say(PROGRAM, sentence)
         if not options.json:
             print(f"  {'report':<16} {options.report}")
         return flags, str(options.report)
@@ -323,9 +323,9 @@ class AfterTune(Tuned):
         gains = found.best_gains
         if gains is None:
             raise RelayAutotuneError(found.reason)
-        told = ", ".join(f"{name} {digits(getattr(gains, name))}" for name in ("kc", "ti", "td"))
-        told += f", every {period:g} s; {'; '.join(gains.warnings) or 'Ms ' + digits(gains.ms, 3)}"
-        tell(f"for {law}", told)
+        text = ", ".join(f"{name} {digits(getattr(gains, name))}" for name in ("kc", "ti", "td"))
+        text += f", every {period:g} s; {'; '.join(gains.warnings) or 'Ms ' + digits(gains.ms, 3)}"
+        tell(f"for {law}", text)
         return _Written(gains, law, against or found.judgement.reason)
 
     def _own_controller(self) -> Steps:

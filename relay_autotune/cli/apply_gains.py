@@ -302,14 +302,14 @@ def found_entries(result: Any) -> Entries:
     from relay_autotune.control.verification import SETTLED
 
     passed = result.verdict == result.PASSED
-    told = "passed: the loop does what the model predicts"
+    verdict = "passed: the loop does what the model predicts"
     if not passed:
-        told = f"{'failed' if result.verdict == result.FAILED else 'none'}: {result.reason}"
+        verdict = f"{'failed' if result.verdict == result.FAILED else 'none'}: {result.reason}"
     whys = [reason_from_message(step.why) for step in result.steps]
     narrow = [str(why["narrow"]) for why in whys if why.code is Code.NARROWLY]
     if narrow and passed:
-        told = f"passed, narrowly: {'; '.join(narrow)}"
-    found = [("verdict", told)]
+        verdict = f"passed, narrowly: {'; '.join(narrow)}"
+    found = [("verdict", verdict)]
     for step, why in zip(result.steps, whys, strict=True):
         setpoint = step.kind == step.SETPOINT
         # A controller_node of an older version does not tell what the noise adds.
@@ -333,6 +333,6 @@ def found_entries(result: Any) -> Entries:
         )
         ms = " and ".join(f"{step.ms:.2f}" for step in result.steps)
         predicted = result.steps[0].ms_predicted
-        told = f"gain {gain} times the model's, Ms {ms} (predicted {predicted:.2f})"
-        found.append(("process", told))
+        process = f"gain {gain} times the model's, Ms {ms} (predicted {predicted:.2f})"
+        found.append(("process", process))
     return tuple(found)

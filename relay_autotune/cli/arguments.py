@@ -121,11 +121,11 @@ def say(program: str, text: str) -> None:
     :param program: name of the command.
     :param text: the message; control characters in it are made visible.
     """
-    told = visible(f"{program}: {text}", keep="\n")
+    message = visible(f"{program}: {text}", keep="\n")
     if sys.stderr.isatty():
         # A terminal would break lines within words.
-        told = "\n".join("\n".join(broken(line, width())) for line in told.split("\n"))
-    print(told, file=sys.stderr)
+        message = "\n".join("\n".join(broken(line, width())) for line in message.split("\n"))
+    print(message, file=sys.stderr)
 
 
 def run_command(program: str, work: Callable[[], int]) -> int:
@@ -276,12 +276,12 @@ def as_typed(
     values = vars(options) | changed
     flags: list[str] = []
     given: list[str] = []
-    told = set()
+    written = set()
     for action in parser._actions:
         value = values.get(action.dest)
-        if action.dest in told or value is None or value == action.default:
+        if action.dest in written or value is None or value == action.default:
             continue
-        told.add(action.dest)
+        written.add(action.dest)
         words = [_typed(each) for each in (value if isinstance(value, list) else [value])]
         if not action.option_strings:
             given += words

@@ -95,7 +95,7 @@ class JointLoop(Loop):
                 f"{loop.reference_topic}, and wait until the joint rests there"
             )
         super().__init__(client(namespace_of_joint(loop.node, loop.joint), robot), options)
-        # The reference is given back after that, and told then.
+        # The reference is given back after that, and reported then.
         back = f"{loop.joint} gets back its controllers of before" if options.open else ""
         self.client.left_behind = back
         self._take_known()
@@ -113,8 +113,8 @@ class JointLoop(Loop):
             return
         if answers["at"] is None and math.isfinite(loop.state.output):
             answers.take({"at": loop.state.output}, "its output")
-        told = [loop.clamps, loop.command_within or (-math.inf, math.inf)]
-        found = [max(low for low, _ in told), min(high for _, high in told)]
+        limits = [loop.clamps, loop.command_within or (-math.inf, math.inf)]
+        found = [max(low for low, _ in limits), min(high for _, high in limits)]
         if answers["command_within"] is None and all(map(math.isfinite, found)):
             answers.take({"command_within": found}, "its limits")
 
@@ -157,8 +157,8 @@ class JointLoop(Loop):
         self._manager.require_alone()
         loop = self._loop
         lines = [
-            ChecklistLine(Mark.OK, name, told)
-            for name, told in (
+            ChecklistLine(Mark.OK, name, text)
+            for name, text in (
                 ("joint", f"{loop.joint}: {loop.measured}, commanded by {loop.interface}"),
                 (
                     "controller",
@@ -273,9 +273,9 @@ class JointLoop(Loop):
             set(loop.dofs) - {name.rpartition("/")[0] for name in self._forward.needs}
         )
         if without:
-            told = ", ".join(without)
+            names = ", ".join(without)
             kept = "command 0" if loop.follows else "its last command"
-            yield "no control", f"{told} keeps {kept}, with no controller meanwhile"
+            yield "no control", f"{names} keeps {kept}, with no controller meanwhile"
         typed = self._manager.command_for(self._former, [self._forward.name])
         yield "if killed", f"only kill -9 of this command leaves that; then type: {typed}"
 
@@ -336,7 +336,7 @@ class JointLoop(Loop):
         return topics, values
 
     def _commands_beside(self, forward: ManagedController) -> list[float]:
-        """Return what each interface of the forwarding controller is told; NaN: the joint."""
+        """Return what each interface of the forwarding controller gets; NaN: the joint."""
         loop = self._loop
         outputs = {
             f"{dof}/{loop.commanded}": state.output
@@ -345,7 +345,7 @@ class JointLoop(Loop):
         others = [name for name in forward.needs if name != loop.interface]
         if self.options.command_message and others:
             return self._given_beside(forward)
-        told = {loop.interface: math.nan}
+        commands = {loop.interface: math.nan}
         for name in others:
             value = outputs.get(name, math.nan)
             joint, _, kind = name.rpartition("/")
@@ -359,8 +359,8 @@ class JointLoop(Loop):
                     f"--command-message '{{data: [...]}}' with {len(forward.needs)} numbers, "
                     f"those of {', '.join(forward.needs)}"
                 )
-            told[name] = value
-        return [told[name] for name in forward.needs]
+            commands[name] = value
+        return [commands[name] for name in forward.needs]
 
     def _given_beside(self, forward: ManagedController) -> list[float]:
         with suppress(yaml.YAMLError, TypeError, ValueError, KeyError):
@@ -444,8 +444,8 @@ class JointLoop(Loop):
         states = message_class(STATE_TYPE, "measurement_type")
 
         def is_back(message: Any) -> bool:
-            told = {dof.name: dof.reference for dof in message.dof_states}
-            return bool(told.get(loop.joint) == reference)
+            references = {dof.name: dof.reference for dof in message.dof_states}
+            return bool(references.get(loop.joint) == reference)
 
         if math.isfinite(reference) and not self._robot.publish(
             commands.written(reference), loop.reference_topic, states, loop.state_topic, is_back
@@ -542,8 +542,8 @@ class JointLoop(Loop):
                 self._say_unverified(before, now)
             if not self.options.export:
                 lines = ", ".join(f"{name} {value:.6g}" for name, value in now.items())
-                told = f"the gains are those of its parameter file again: put there {lines}"
-                tell("after a restart", told)
+                advice = f"the gains are those of its parameter file again: put there {lines}"
+                tell("after a restart", advice)
         return in_force, failed
 
     def _start_controller(self) -> None:

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 # Purpose and text of each command that may follow.
 Steps = list[tuple[str, str]]
-# Told the state of a tune, tells why it has to end; empty: it goes on.
+# Says, from the state of a tune, why it has to end; empty: it goes on.
 WhyOver = Callable[[int], str]
 # Time between two looks at a tune, and two updates of a terminal [s].
 _TICK = 0.25
@@ -265,7 +265,7 @@ class Loop:
 
     @property
     def is_silent(self) -> bool:
-        """Whether the last tune ended since its sensor told nothing any more."""
+        """Whether the last tune ended since its sensor fell silent."""
         return self.client.result.why.code in (Code.SILENT_SENSOR, Code.SENSOR_GONE)
 
     def left(self) -> str:
@@ -369,7 +369,7 @@ class TopicLoop(Loop):
             try:
                 return reader_of(self._kind, options.field)
             except ParameterError as error:
-                told = as_flags(str(error))
+                problem = as_flags(str(error))
             root = struct_of(message_class(self._kind, "measurement_type"))
             only = only_field(root)
             if only and options.field == SETTING["field"].default != only:
@@ -379,9 +379,9 @@ class TopicLoop(Loop):
             first = "".join(first_numbers(root, 1))
             if not (first and sys.stdin.isatty()):
                 raise SelectionError(
-                    f"{told}: give it, such as --field {first}" if first else told
+                    f"{problem}: give it, such as --field {first}" if first else problem
                 )
-            print("\n".join(broken(told, width())), file=sys.stderr)
+            print("\n".join(broken(problem, width())), file=sys.stderr)
             what = "the number that measures"
             options.field = asked(what, "--field", first, first, lambda text: text or None)
 
@@ -418,11 +418,11 @@ class TopicLoop(Loop):
             present = sum(heard) / len(heard)
             says = f", {present:.6g} u now"
             at = f" with --at {present:.6g}, while the process still rests there"
-        told = (
+        problem = (
             f"{others} commands {topic}{says}: end it first (Ctrl-C where it runs; one that was "
             f"killed is forgotten after some 20 s), then start again{at}"
         )
-        raise LoopError(in_units(told, UNITS))
+        raise LoopError(in_units(problem, UNITS))
 
     def arguments(self) -> dict[str, list[str]]:
         """Return the arguments for ROS of its nodes, by the names of their executables."""
@@ -461,17 +461,17 @@ class TopicLoop(Loop):
                 f"{self.safe_command} was sent, but nobody takes commands from {topic} any more: "
                 f"see to the plant"
             )
-        if told := super().left():
-            return told
+        if left := super().left():
+            return left
         if self._rests_elsewhere:
             return (
                 f"the command stands at {command:.6g} u, which is not the one at which the "
                 f"process rested: set the right one now"
             )
-        told = f"the plant is left at {self.safe_command}"
+        left = f"the plant is left at {self.safe_command}"
         if self.left_its_limits:
-            told += ": look whether the process rests there, else set the right one now"
-        return told
+            left += ": look whether the process rests there, else set the right one now"
+        return left
 
     def other_commander(self) -> str:
         """Return who else commanded during a tune that ended for that; empty: nobody."""
@@ -482,11 +482,11 @@ class TopicLoop(Loop):
     def again(self, command: str) -> Steps:
         """Return how to tune it again; the same tune may drive the process away."""
         if self._rests_elsewhere:
-            told = "start again with --at and the command at which it rests"
-            return [("once it rests", told)]
+            advice = "start again with --at and the command at which it rests"
+            return [("once it rests", advice)]
         if self.left_its_limits:
-            told = "the --at at which it rests, a smaller --amplitude, or wider --within"
-            return [("once it rests", f"start again with {told}")]
+            changes = "the --at at which it rests, a smaller --amplitude, or wider --within"
+            return [("once it rests", f"start again with {changes}")]
         others = self.other_commander()
         first = [("first", f"end {others}, which commands {self.options.command}")] * bool(others)
         return [*first, *super().again(command)]

@@ -106,8 +106,8 @@ def _run(options: argparse.Namespace) -> int:
             unclear = isinstance(error, SelectionError)
             if unclear and len(sources) == 1:
                 raise
-            told = any(name in str(error) for name in names)
-            say(PROGRAM, str(error) if told else f"{', '.join(names)}: {error}")
+            is_named = any(name in str(error) for name in names)
+            say(PROGRAM, str(error) if is_named else f"{', '.join(names)}: {error}")
             status = worst(status, USAGE if unclear else NOTHING_FOUND)
             failed += 1
             found = [unreadable(", ".join(names), str(error))]
@@ -179,7 +179,7 @@ def check_output(output: str) -> None:
             f"{path} exists and is not a report of this package; name another file, or remove it"
         )
     if path.suffix.lower() == ".html":
-        # A package that is missing is told here, too.
+        # A missing package is reported here, too.
         import relay_autotune.report.page  # noqa: F401
     try:
         # Only an attempt tells of rights, of file systems and of the length of names.

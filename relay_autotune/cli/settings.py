@@ -280,8 +280,8 @@ class Answers:
         for name, value in given.items():
             found, ends = _numbers(value), SETTING[name].ends
             if len(found) != ends or found != sorted(set(found)):
-                told = "two numbers, the lower one first" if ends > 1 else "one number"
-                raise AnswerError(f"{SETTING[name].question}: expected {told}", name)
+                expected = "two numbers, the lower one first" if ends > 1 else "one number"
+                raise AnswerError(f"{SETTING[name].question}: expected {expected}", name)
             # A page sends whole numbers as such, which ROS does not take for a double.
             setattr(wanted.options, name, found if ends > 1 else found[0])
         for name, value in given.items():
@@ -301,9 +301,9 @@ class Answers:
         value = self._seen(name)
         if name == "amplitude" or math.isnan(value):
             return ""
-        told = f"{value:.4g} {SETTING[name].unit}"
+        present = f"{value:.4g} {SETTING[name].unit}"
         # The command is not measured.
-        return f"{told} now" if name == "within" else f"the present one given as {told}"
+        return f"{present} now" if name == "within" else f"the present one given as {present}"
 
     def _seen(self, name: str) -> float:
         """Return the present value of a setting's quantity; NaN: it is not known."""
@@ -322,8 +322,8 @@ class Answers:
             what = "the present command is {}"
         elif name == "at" and (limits := self["command_within"]):
             low, high = limits
-            told = f"expected a command from {low:g} to {high:g}, the limits of the actuator"
-            return "" if low <= value <= high else told
+            problem = f"expected a command from {low:g} to {high:g}, the limits of the actuator"
+            return "" if low <= value <= high else problem
         elif name == "amplitude":
             return "" if value >= 0.0 else "expected at least 0"
         else:
@@ -355,10 +355,10 @@ class Answers:
             if (given := self[each.name]) is not None:
                 self.take({each.name: given}, self.source(each.name))
         self._asked = [each for each in questions if self.lacks(each.name)]
-        told = ["u is the command's unit, y the measurement's"] * (len(UNITS) < 2)
-        told += [f"{BACK} at a question goes back to the one before"] * (len(self._asked) > 1)
-        if sys.stdin.isatty() and self._asked and told:
-            print("; ".join(told), file=sys.stderr)
+        hints = ["u is the command's unit, y the measurement's"] * (len(UNITS) < 2)
+        hints += [f"{BACK} at a question goes back to the one before"] * (len(self._asked) > 1)
+        if sys.stdin.isatty() and self._asked and hints:
+            print("; ".join(hints), file=sys.stderr)
         self._ask_from(0)
 
     def ask_again(self) -> list[str]:
@@ -471,7 +471,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
 
     :param parser: of tune_loop.
     """
-    groups = {kind: parser.add_argument_group(*told) for kind, told in _GROUPS.items()}
+    groups = {kind: parser.add_argument_group(*heading) for kind, heading in _GROUPS.items()}
     for each in SETTINGS:
         each.add_to(groups.get(each.loops[-1], parser))
     # The name that --output had in scripts of before.
@@ -495,19 +495,19 @@ def kind_of(options: argparse.Namespace) -> Kind:
         if kind in each.loops or not each.is_given(options):
             continue
         if each.loops == (Kind.NODES,):
-            told = "nodes that run already: leave it out"
+            purpose = "nodes that run already: leave it out"
         elif kind in _JOINTS:
             what = "--open" if Kind.OPENED in each.loops else "a loop of two topics"
-            told = f"{what}: leave it out, since the controller tells it"
+            purpose = f"{what}: leave it out, since the controller tells it"
         elif Kind.TOPICS in each.loops:
-            told = f"a loop without nodes: give {' and '.join(lacking)}, too"
+            purpose = f"a loop without nodes: give {' and '.join(lacking)}, too"
             if each.name in ("verify", "step") and len(lacking) == 2:
                 where = ["--namespace", options.namespace] * bool(options.namespace)
                 how = shlex.join(["apply_gains", *where])
-                told += f"; where nodes run already, prove the gains with: {how}"
+                purpose += f"; where nodes run already, prove the gains with: {how}"
         else:
-            told = "a joint: give --controller and --joint, too"
-        raise SelectionError(f"{flag_of(each)} is for {told}")
+            purpose = "a joint: give --controller and --joint, too"
+        raise SelectionError(f"{flag_of(each)} is for {purpose}")
     return kind
 
 

@@ -44,9 +44,9 @@ if TYPE_CHECKING:
     from relay_autotune.process.transfer_function import TransferFunction
     from relay_autotune.result import Analysis
 
-# Chances below this are not told apart.
+# Chances below this are not distinguished.
 _SURE = 1e-4
-# Rivals beyond these are told in the JSON document alone.
+# Rivals beyond these are in the JSON document alone.
 _RIVALS = 3
 
 # What stands beside each other on a line: a label and a text, whose parts are three blanks apart.
@@ -110,7 +110,7 @@ def heading(name_width: int, units: Mapping[str, str]) -> str:
     :param units: of the measurement, by "y", and of the command, by "u", as far as they are known.
     """
     named = [(name, in_units(unit, units), unit, wide) for name, unit, wide in _NUMBERS]
-    words = [told if len(told) <= wide else unit for _, told, unit, wide in named]
+    words = [actual if len(actual) <= wide else unit for _, actual, unit, wide in named]
     above = (("verdict", [name for name, *_ in named]), ("", words))
     return "\n".join(_lines("", word, cells, name_width, WIDEST)[0] for word, cells in above)
 
@@ -227,8 +227,8 @@ def _experiment(analysis: Analysis, which: str, form: str) -> list[_Entry]:
     name = f"  ({record.experiment_id})" if record.experiment_id else ""
     lines = [(f"experiment{which}", record.outcome.words + name)]
     # The reason for no gains begins with it.
-    told = record.reason in analysis.reason
-    if record.reason and not told and record.outcome != Outcome.COMPLETED:
+    is_repeated = record.reason in analysis.reason
+    if record.reason and not is_repeated and record.outcome != Outcome.COMPLETED:
         lines.append(("", record.reason))
     begun = f", from {date_text(record.start)}" if record.start else ""
     span = span_text(record.duration, len(record), record.lost_samples)
@@ -259,11 +259,11 @@ def _verdict(judgement: Judgement) -> list[_Entry]:
         # The worst finding is shown where the gains would be.
         worse = [f for f in worse if f is not judgement.worst]
     # What was refused was not for its checks.
-    told = [judgement.verdict.name.lower(), *[judgement.passed] * (not judgement.refused)]
+    words = [judgement.verdict.name.lower(), *[judgement.passed] * (not judgement.refused)]
     if judgement.contradicted and not judgement.refused and judgement.worst is not None:
-        told[-1] += f"; failed: {judgement.worst.title.lower()}"
+        words[-1] += f"; failed: {judgement.worst.title.lower()}"
     return [
-        ("verdict", ", ".join(told)),
+        ("verdict", ", ".join(words)),
         *((f"  {found.title.lower()}", found.said) for found in worse),
     ]
 

@@ -184,7 +184,7 @@ def write(text: str, path: str | None) -> None:
         raise SelectionError(f"{path} cannot be written: {system_says(error)}") from error
 
 
-# Time after which a terminal is first told what is being done [s]: several short works in a row
+# Time after which a terminal first says what is being done [s]: several short works in a row
 # must not be silent together.
 _SOON = 0.3
 
@@ -322,11 +322,11 @@ def asked_for_file(what: str, names: Collection[str]) -> str:
         # A word with neither folder nor ending is a program that was mistyped.
         if file.suffix or os.sep in answer:
             return str(file)
-        told = (
+        problem = (
             f"{answer} is neither a program nor the name of a file: expected a file with its "
             f"ending, such as gains.yaml, Enter for none, or one of {', '.join(names)}"
         )
-        print("\n".join(broken(told, width())), file=sys.stderr)
+        print("\n".join(broken(problem, width())), file=sys.stderr)
 
 
 # What goes back to the question before.
@@ -448,8 +448,8 @@ def agreed_step(question: str, step: float, allowed: StepRange) -> float:
         other = number_of(answer)
         if other is not None and allowed.allows(other):
             return other
-        told = f"expected y, n, or the height of the step, {allowed.words}"
-        print("\n".join(broken(told, width())), file=sys.stderr)
+        problem = f"expected y, n, or the height of the step, {allowed.words}"
+        print("\n".join(broken(problem, width())), file=sys.stderr)
 
 
 def asked(

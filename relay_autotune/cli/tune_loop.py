@@ -171,8 +171,8 @@ class Session:
         if starts:
             # At once, since what follows takes a second to load.
             what = (options.joint or options.measurement, options.controller or options.command)
-            told = f"looking at {what[0]} and {what[1]}; nothing is commanded yet"
-            print(told, file=sys.stderr, flush=True)
+            sentence = f"looking at {what[0]} and {what[1]}; nothing is commanded yet"
+            print(sentence, file=sys.stderr, flush=True)
         with Working("loading what talks to the nodes") if starts else nullcontext():
             import relay_autotune.nodes.tune_client  # noqa: F401  see Signals
         if starts or options.dry_run:
@@ -296,8 +296,8 @@ class Session:
         client, options = loop.client, self.options
         may, checks = client.succeeded, loop.checklist(found)
         if options.json and (options.dry_run or not may):
-            told = {"accepted": may, "reason": found.reason, "checks": checks}
-            print(json.dumps({"node": client.name} | told))
+            document = {"accepted": may, "reason": found.reason, "checks": checks}
+            print(json.dumps({"node": client.name} | document))
         elif checks:
             shown = "\n".join(check_lines(checks, width()))
             print(shown, flush=True, file=sys.stdout if options.dry_run else sys.stderr)

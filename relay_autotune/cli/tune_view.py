@@ -118,14 +118,14 @@ def log_line(feedback: Any, before: Any = None) -> str:
     :param before: the feedback before it, None for the first.
     """
     state = STATES[feedback.state]
-    told = feedback.status or state
+    line = feedback.status or state
     if state == "completed" and (before is None or before.state != feedback.state):
-        told = cycle_line(state, feedback)
+        line = cycle_line(state, feedback)
     elif feedback.cycle and (before is None or before.cycle != feedback.cycle):
-        told = cycle_line(f"cycle {feedback.cycle}", feedback)
+        line = cycle_line(f"cycle {feedback.cycle}", feedback)
         if math.isfinite(feedback.remaining) and feedback.remaining > 0.0:
-            told += f", about {duration(feedback.remaining)} left"
-    return f"{feedback.elapsed:8.1f} s  {told}"
+            line += f", about {duration(feedback.remaining)} left"
+    return f"{feedback.elapsed:8.1f} s  {line}"
 
 
 def live_lines(
@@ -151,9 +151,9 @@ def live_lines(
     if math.isfinite(left) and left > 0.0:
         times += f", about {duration(left)} left"
     lines = [f"  {paint(f'{state:<10}', _BOLD)} {bar} {100.0 * feedback.progress:3.0f} %  {times}"]
-    told = textwrap.wrap(feedback.status, width - 14, max_lines=_STATUS_LINES, placeholder=" ...")
-    told += [""] * (_STATUS_LINES - len(told))
-    lines += [f"  {'':<10} {line}".rstrip() for line in told]
+    rows = textwrap.wrap(feedback.status, width - 14, max_lines=_STATUS_LINES, placeholder=" ...")
+    rows += [""] * (_STATUS_LINES - len(rows))
+    lines += [f"  {'':<10} {line}".rstrip() for line in rows]
     cycle = f"cycle {feedback.cycle}: {oscillation(feedback)}" if feedback.cycle else ""
     lines.append(f"  {'':<10} {cycle}".rstrip())
     lines.append(f"  {'':<10} {estimate(feedback)}".rstrip())
@@ -206,14 +206,14 @@ def result_lines(
     outcome = "cancelled" if cancelled else OUTCOMES[result.outcome]
     colour = {"completed": _GREEN}.get(outcome, _RED)
     repeats = _OUTCOME_OF.get(result.why.code) == outcome
-    told = result.reason if repeats else f"{outcome}: {result.reason}"
+    sentence = result.reason if repeats else f"{outcome}: {result.reason}"
     if cancelled and result.outcome == result.COMPLETED:
-        told = f"cancelled after the relay had ended, before the gains: {result.reason}"
-    first, *rest = labelled("tune", told, columns)
+        sentence = f"cancelled after the relay had ended, before the gains: {result.reason}"
+    first, *rest = labelled("tune", sentence, columns)
     lines = [first.replace(outcome, paint(outcome, f"{_BOLD};{colour}"), 1), *rest]
     if outcome != "completed":
-        told = "; ".join(filter(None, (left, "no gains are given")))
-        lines += labelled("", told, columns)
+        sentence = "; ".join(filter(None, (left, "no gains are given")))
+        lines += labelled("", sentence, columns)
     if result.transfer_function.experiment_id:
         found = identification_from_message(result.transfer_function)
         lines += ["", *identification_lines(found, columns)]
@@ -229,14 +229,14 @@ def _verdict_lines(result: Any, paint: Paint, columns: int) -> list[str]:
     verdict = Verdict(result.verdict)
     colour = {Verdict.TRUSTED: _GREEN, Verdict.DOUBTFUL: _YELLOW}.get(verdict, _RED)
     lines = [f"  {'verdict':<16} {paint(verdict.name.lower(), f'{_BOLD};{colour}')}"]
-    told, model = result.verdict_reason, result.transfer_function
+    reason, model = result.verdict_reason, result.transfer_function
     known = verdict is Verdict.TRUSTED and math.isfinite(result.gains.ms_95)
     if known and (model.undetermined or model.warnings):
-        told = (
+        reason = (
             f"whatever is not determined or warned of here, with these gains Ms stays below "
             f"{digits(result.gains.ms_95, 3)} on 95 % of the models that the data allow"
         )
-    return lines + (labelled("", told, columns) if told else [])
+    return lines + (labelled("", reason, columns) if reason else [])
 
 
 def next_commands(

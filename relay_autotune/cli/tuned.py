@@ -272,8 +272,8 @@ def gains_words(gains: Controller | None) -> str:
     """Return gains in words."""
     if gains is None:
         return "no gains; its command is held"
-    told = f"kc {digits(gains.kc)} u/y, ti {digits(gains.ti)} s, td {digits(gains.td)} s"
+    words = f"kc {digits(gains.kc)} u/y, ti {digits(gains.ti)} s, td {digits(gains.td)} s"
     if isinstance(gains, Gains) and gains.law:
         # Under another law the same numbers are other gains.
-        told += f", {gains.law} every {gains.law_period:g} s"
-    return told
+        words += f", {gains.law} every {gains.law_period:g} s"
+    return words
