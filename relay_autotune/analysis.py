@@ -507,7 +507,7 @@ def _apart(a: Identification, b: Identification) -> float:
 
 # Measured by the experiment, so they are no parameters.
 _MEASURED = ("noise_std", "amplitude")
-# Renamed, because the plain name would mean something else beside a controller's parameters.
+# Renamed, because the plain name would mean something else among a controller's parameters.
 _PREFIXED = {"gain": "known_gain", "dead_time": "known_dead_time"}
 
 KNOWN = tuple(

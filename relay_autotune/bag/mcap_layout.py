@@ -31,7 +31,7 @@ from relay_autotune.bag.mcap_records import (
 )
 from relay_autotune.bag.source import MAGIC, DamageError, Source, expanding
 
-# What a chunk takes beside its content, compressed or not.
+# What a chunk takes besides its content, compressed or not.
 _CHUNK_OVERHEAD = 1 << 20
 # Size of the pieces in which records outside of chunks are read [bytes].
 _PIECE = 1 << 20

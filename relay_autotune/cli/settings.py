@@ -274,7 +274,7 @@ class Answers:
 
         :param given: numbers and ranges by the names of their settings.
         :param source: where they come from; empty: each is named by its question.
-        :raises AnswerError: if one of them cannot be, beside the others.
+        :raises AnswerError: if one of them is impossible with the others.
         """
         wanted = replace(self, options=argparse.Namespace(**vars(self.options)))
         for name, value in given.items():

@@ -316,7 +316,7 @@ def _identification(found: Identification) -> list[_Entry]:
 
 
 def _known_all_the_same(found: Identification) -> list[_Entry]:
-    """Return what is determined beside parameters that are not, and what would help."""
+    """Return what is determined although parameters are not, and what would help."""
     # K_u and w_u have lines of their own.
     shown = [c for c in found.combinations if not c.name.startswith("ultimate")]
     lines = []

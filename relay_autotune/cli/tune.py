@@ -272,7 +272,7 @@ class _Designs:
     :param task: what is designed.
     :param rule: the rule that was asked for.
     :param form: in which gains are shown: "isa", "parallel" or "series".
-    :param every: whether all rules are asked, beside that one.
+    :param every: whether all rules are asked, besides that one.
     :param known: what that one gives, if it was asked before.
     :raises TuningError: if that one is asked alone, and gives none.
     """

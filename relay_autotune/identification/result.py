@@ -209,7 +209,7 @@ class Identification:
     draws: tuple[TransferFunction, ...] = result_field("", (), message=None, optional=True)
     """Models that the record allows, of either direction, each as likely as the others; left
     out: the method knows the covariance alone."""
-    # The model's measurement at the record's samples, with all that was estimated beside the
+    # The model's measurement at the record's samples, with all that was estimated with the
     # model [y], shape (n,); NaN: not part of the fit; empty: not computed. It is as long as the
     # record, and so in no document or message.
     fitted: FloatArray = field(default_factory=lambda: np.empty(0))
@@ -227,12 +227,12 @@ class Identification:
     play: float = 0.0
     # Dry friction that was estimated with the model, as a command [u]; 0: none.
     friction: float = 0.0
-    # Standard deviation of the measurement beside drift, past and load, which the model has to
+    # Standard deviation of the measurement without drift, past and load, which the model has to
     # explain [y]; NaN: the whole measurement.
     to_explain: float = math.nan
     # Models that each part of the record allows by itself.
     parts: tuple[Part, ...] = ()
-    # Returns the FOPDT that was fitted beside the model; None: there is none, or it is the model.
+    # Returns the FOPDT that was fitted besides the model; None: there is none, or it is the model.
     plain: Callable[[], Identification | None] | None = None
 
     def __repr__(self) -> str:

@@ -439,7 +439,7 @@ def performance_beside(
         time of the law's hold.
     :param new: those that they are compared with, as there.
     :param model: the process.
-    :param added_delay: dead time of the loop beside it [s]; NaN: that of the law's hold alone.
+    :param added_delay: dead time of the loop besides it [s]; NaN: that of the law's hold alone.
     """
     hold = LAWS[new.law].lag(new.law_period) if new and new.law in LAWS else 0.0
     delay, law = hold if math.isnan(added_delay) else added_delay, as_run(present, new)

@@ -55,8 +55,8 @@ def closed_loop_unstable_poles(terms: Sequence[TransferFunction]) -> float:
     """Return the number of zeros of ``1 + sum L_k(s)`` in the right half plane.
 
     :param terms: the L_k. Poles that several terms share count once.
-    :return: a whole number; infinite for infinitely many zeros, one on the axis, or so many turns
-        that they were not counted.
+    :return: a whole number; infinite for infinitely many zeros, one on the axis, or too many turns
+        to be counted.
     :raises TuningError: if a term has poles on the imaginary axis other than at s = 0.
     """
     if any(t.real == 0.0 for term in terms for t in term.time_constants):

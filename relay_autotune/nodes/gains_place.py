@@ -111,7 +111,7 @@ def in_another_node(gains: Controller, rate: LawRate | None, feedforward: float)
 
     :param gains: the gains.
     :param rate: its law; None: not known, our own stands for it.
-    :param feedforward: its gain from the set-point to the command beside these [u/y]; with
+    :param feedforward: its gain from the set-point to the command, added to these [u/y]; with
         ``kc (b r - y)`` it is a set-point weight ``b + feedforward/kc``, which no law has.
     """
     if rate is not None:
@@ -228,7 +228,7 @@ class RemoteGains(_Place):
     :param node: the calling node.
     :param target: name of the controlling node.
     :param mapping: its parameter name for each gain.
-    :param feedforward: its gain from the set-point to the command beside these [u/y].
+    :param feedforward: its gain from the set-point to the command, added to these [u/y].
     """
 
     outlives = True

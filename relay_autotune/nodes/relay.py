@@ -455,7 +455,7 @@ class RelayNode(ServedNode):
 
 
 def require_reported(values: Mapping[str, Any]) -> None:
-    """Refuse a command beside the measurement with which nothing would be done."""
+    """Refuse a command in the measurement's message that nothing would use."""
     field = values["controller_command_field"]
     if field and (values["relay_on"], values["path"]) != ("setpoint", "passthrough"):
         raise ParameterError(

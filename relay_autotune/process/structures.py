@@ -363,7 +363,7 @@ TABLE = {
     )
 }
 
-# The fields of a model beside its structure.
+# The fields of a model, without its structure.
 FIELDS = (
     *("gain", "time_constants", "zeros", "dead_time"),
     *("order", "natural_frequency", "damping"),

@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Average a long record in blocks that are short beside its response.
+"""Average a long record in blocks that are short against its response.
 
 Some thousand samples determine a model of a few parameters; a million of them cost time and
 memory for useless digits. The mean over a block keeps the information of its samples: white noise
@@ -87,7 +87,7 @@ def _changes(record: Record) -> IntArray:
 
 
 def _slow_enough(y: FloatArray, wanted: int, *, white: bool) -> int:
-    """Return the largest block, up to the wanted size, that is short beside the response.
+    """Return the largest block, up to the wanted size, that is short against the response.
 
     :param y: the measurement [y], shape (n,).
     :param wanted: samples in a block.

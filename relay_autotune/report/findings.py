@@ -200,7 +200,7 @@ def remarks_of(case: Case) -> tuple[str, ...]:
 
 
 def _noted(case: Case) -> tuple[str, ...]:
-    """Return what model, gains and cycles have to say beside the checks."""
+    """Return what model, gains and cycles have to say besides the checks."""
     found = list(case.model.warnings) if case.model is not None else []
     if case.best_gains is not None:
         found += case.best_gains.warnings

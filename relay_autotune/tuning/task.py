@@ -247,7 +247,7 @@ _MS = 1.01
 
 
 def cost_of(law: SampledLaw, found: Performance, own: Performance | None) -> tuple[str, ...]:
-    """Return a sentence on what a law costs beside controller_node; none if that is little.
+    """Return a sentence on what a law costs against controller_node; none if that is little.
 
     :param law: with its gains.
     :param found: what it does on the model.

@@ -72,7 +72,7 @@ def read_backward(record: Record, model: TransferFunction) -> float | None:
 def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> str | None:
     """Say whether a process has another gain for larger changes of the command.
 
-    Each record's response gets a gain of its own, in the least-squares sense, beside an offset and
+    Each record's response gets a gain of its own, in the least-squares sense, with an offset and
     a drift; a valve that sticks, or a flow that goes with the root of a pressure, has gains that
     depend on the amplitude.
 
@@ -105,7 +105,7 @@ def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> st
 def _factor(record: Record, answer: FloatArray) -> tuple[float, float]:
     """Return the factor of a response in a record, and its standard deviation.
 
-    An offset and a drift are estimated beside it.
+    An offset and a drift are estimated with it.
 
     :param answer: of the record's length.
     """

@@ -187,7 +187,7 @@ def _difference(found: Identification, record: Record) -> Difference | None:
 
 
 def _power_beside_lines(time: FloatArray, x: FloatArray, pieces: int) -> float:
-    """Return the variance of samples beside another line in each of some pieces.
+    """Return the variance of samples about a line of its own in each of some pieces.
 
     A disturbance so slow is no evidence for or against a model near its ultimate frequency.
 

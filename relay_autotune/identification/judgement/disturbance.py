@@ -100,5 +100,5 @@ def _of_end(record: Record, identify: Callable[[Record], Identification]) -> Ide
         f"all before {record.time[left_out]:.4g} s is left out, since no model fits it together "
         f"with the last {KEPT_CYCLES} cycles: a load or another disturbance came"
     )
-    # The FOPDT beside it has no samples of what is left out.
+    # Its FOPDT has no samples of what is left out.
     return replace(alone, fitted=fitted, plain=None, warnings=(*alone.warnings, warning))

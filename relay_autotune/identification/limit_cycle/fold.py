@@ -472,7 +472,7 @@ def _overlaid(
 
 
 def switched_at(record: Record, samples: Sequence[int]) -> FloatArray:
-    """Return when the command switched beside some samples [s].
+    """Return when the command switched next to some samples [s].
 
     :param record: with a command that switches.
     :param samples: numbers of the samples.
