@@ -117,7 +117,7 @@ def analyse(
     >>> print(found.model.model)
     0.6204 e^(-15.89 s) / (1 + 110.2 s)
     >>> print(found.best_gains)
-    kc = 4.809, ti = 41.91 s, td = 7.526 s
+    kc = 4.813, ti = 41.85 s, td = 7.556 s
 
     Data without a usable model are a result, not an exception: the reason says what was found and
     what to do. Only a completed experiment, or data without any outcome, yield gains, and only if
