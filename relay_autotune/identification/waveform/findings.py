@@ -102,11 +102,11 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     if found.ultimate_frequency * min(r.interval for r in records) > math.pi:
         # Samples show nothing of what is faster than half their rate.
         gain_std = frequency_std = math.nan
-        told = (
+        warning = (
             f"the model's ultimate frequency of {found.ultimate_frequency:.3g} rad/s is beyond "
             "half the rate of the samples: the record does not show K_u and w_u"
         )
-        found = replace(found, warnings=(*found.warnings, told))
+        found = replace(found, warnings=(*found.warnings, warning))
     found = _with_rivals(found, fit, shares)
     found = replace(
         found,
@@ -125,12 +125,12 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     )
     apart = f"{math.sqrt(allowed.temper):.2g}"
     if float(apart) > 1.0:
-        told = (
+        warning = (
             f"two parts of the record give models that differ {apart} times "
             "as much as their noise explains: the process, its load or its operating point "
             "changed; intervals are widened to hold both, and gains have to hold on both"
         )
-        found = replace(found, warnings=(*found.warnings, told))
+        found = replace(found, warnings=(*found.warnings, warning))
     return with_what_is_determined(found, records, allowed, quantile)
 
 
@@ -221,13 +221,13 @@ def _with_rivals(found: Identification, fit: Fit, shares: Sequence[float]) -> Id
     if not (found.model.integrators and stable):
         return found
     best = stable[0]
-    told = (
+    warning = (
         "the data do not show whether the process integrates: a stable "
         f"{best.model.structure} with gain {best.model.gain:.3g} has {100 * best.support:.0f} "
         "% of the support; a biased relay or a longer step would show it; K_u and w_u do not "
         "depend on it"
     )
-    return replace(found, warnings=(*found.warnings, told))
+    return replace(found, warnings=(*found.warnings, warning))
 
 
 def _prediction(records: Sequence[Record], problem: Problem, state: Trial) -> float:

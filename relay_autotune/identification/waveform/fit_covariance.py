@@ -95,7 +95,7 @@ def estimate_of(
     """Return the structure's parameters with their covariance to first order.
 
     A dead time is known to half of all times of the process together: without samples before the
-    response, gain and dead time cannot be told apart at all.
+    response, gain and dead time cannot be distinguished at all.
 
     :param problem: what was fitted.
     :param state: its fit.
@@ -117,7 +117,7 @@ def _root(problem: Problem, state: Trial, fit: Fit, inflation: float) -> FloatAr
 
     For least squares that is ``s^2 (J'J)^-1``. For a robust loss r is the loss's derivative, over
     the mean of its second one (Huber 1981). With J = Q R, R is inverted: J'J would lose half of
-    the digits where two parameters can hardly be told apart.
+    the digits where two parameters can hardly be distinguished.
     """
     n = state.residual.size
     jacobian, scores, slope = _scores(problem, state, fit)

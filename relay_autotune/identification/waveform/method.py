@@ -140,7 +140,7 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
     )
     samples, problem = problem.time.size, problem.thinned(_MOST_SAMPLES)
     sign = _sign(records)
-    alike = [told for told in map(_like_a_command, records) if told]
+    alike = list(filter(None, map(_like_a_command, records)))
     try:
         fit = _explained(
             problem, known, sign, scale, held=any(r.settings is not None for r in records)
@@ -148,11 +148,11 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
     except IdentificationError as error:
         raise IdentificationError("; ".join([str(error), *alike])) from error
     if problem.time.size < samples:
-        told = (
+        warning = (
             f"of {samples} samples {problem.time.size} were fitted, evenly spread: more would "
             "take memory and add nothing"
         )
-        fit = replace(fit, warnings=(*fit.warnings, told))
+        fit = replace(fit, warnings=(*fit.warnings, warning))
     fit = replace(fit, warnings=(*alike, *fit.warnings))
     found = report(records, fit)
     return found if fit.plain is None else replace(found, plain=partial(_beside, records, fit))
@@ -214,7 +214,7 @@ def _moves_often(time: FloatArray, u: Input) -> bool:
 
 
 def _beside_stops(problem: Problem, chosen: Choose) -> tuple[Problem, str]:
-    """Return the samples on one side of a stop or a sensor's end, and what is to be told.
+    """Return the samples on one side of a stop or a sensor's end, and a warning.
 
     The measurement stays at an end of its range in mid-movement, and the model of what comes
     before moves on: there the process does not answer, or it is not seen. The side on which the
@@ -252,14 +252,14 @@ def _beside_stops(problem: Problem, chosen: Choose) -> tuple[Problem, str]:
             problem.part(slice(0, stop)), begin, fit, chosen
         ):
             after = problem.part(slice(stop, None))
-            told = (
+            warning = (
                 f"from {problem.time[begin]:.4g} s on the measurement stays at an end of its "
                 "range, where the process would move on: a stop, or the sensor's end; it and all "
             )
             if changes_within(u, after.time).size <= changes.size:
-                return before, f"{told}after it were left out"
+                return before, f"{warning}after it were left out"
             after, more = _beside_stops(after, chosen)
-            return after, "; ".join(filter(None, (f"{told}before it were left out", more)))
+            return after, "; ".join(filter(None, (f"{warning}before it were left out", more)))
     return problem, ""
 
 
@@ -365,11 +365,11 @@ def _spared_of_outliers(problem: Problem, fit: Fit, known: Known, chosen: Choose
     rest = replace(problem, weight=base) if len(problem.bounds) > 1 else problem
     # They hide differences, so that what was hopeless with them is without them.
     again = chosen(rest.part(~outlying), names_near(fit), fit)
-    told = (
+    warning = (
         f"{int(np.sum(outlying))} of the samples lie more than {_OUTLIER:g} standard deviations "
         "off every model and were left out: check the sensor for spikes"
     )
-    return replace(again, warnings=(*fit.warnings, told))
+    return replace(again, warnings=(*fit.warnings, warning))
 
 
 def _reweighted(whole: Problem, fit: Fit, loss: str, base: FloatArray) -> Fit:
@@ -466,8 +466,8 @@ def _require_content(record: Record, u: Input) -> None:
             f"the measurement is constant at {y[0]:g} although the command changes: check the "
             "sensor, the actuator and that both topics belong to one loop"
         )
-    if np.all((y == y.min()) | (y == y.max())) and (told := _like_a_command(record)):
-        raise IdentificationError(told)
+    if np.all((y == y.min()) | (y == y.max())) and (problem := _like_a_command(record)):
+        raise IdentificationError(problem)
 
 
 def _like_a_command(record: Record) -> str:
