@@ -146,7 +146,8 @@ def ended_by_itself(loop: Loop, began: float, why: Why, status: int) -> float:
     taken = until_safe(loop, began)
     loop.check_the_end(why)
     assert loop.process is not None
-    assert loop.process.wait() == status
+    left = loop.process.wait()
+    assert left == status, f"exit status {left}: {loop.process.log[-500:]}"
     assert "Traceback" not in loop.process.log
     loop.process = None
     loop.rig.run_for(0.05)
