@@ -20,6 +20,7 @@ from relay_autotune.identification.waveform import choice
 from relay_autotune.identification.waveform.candidates import (
     Candidate,
     FitContext,
+    as_read,
     nuisances_of,
     support,
 )
@@ -36,7 +37,7 @@ from relay_autotune.identification.waveform.residuals import Colour, colour_cost
 from relay_autotune.identification.waveform.separable import evaluate
 from relay_autotune.identification.waveform.starts import start_fopdt
 from relay_autotune.process.response import response
-from relay_autotune.process.structures import FOPDT
+from relay_autotune.process.structures import FOPDT, LAG_COMPLEX, THREE_LAGS
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.cycles import find_relay, infer_settings
@@ -266,6 +267,16 @@ def test_a_run_up_that_is_not_linear_does_not_hide_a_step():
     model = identify_waveform(Record(time=time, measurement=y, command=command)).model
     assert model.gain == pytest.approx(4000.0, rel=0.1)
     assert model.dead_time < 0.3
+
+
+@pytest.mark.parametrize("fitted", [THREE_LAGS, LAG_COMPLEX])
+@pytest.mark.parametrize(("damping", "name"), [(0.9, "lag_complex"), (1.2, "three_lags")])
+def test_three_lags_and_a_pair_with_a_lag_are_one_fit(fitted, damping, name):
+    """A pair that became two lags in the last steps of a fit left no model at all."""
+    problem = replace(fitted_to_one_step(), structure=fitted)
+    state = evaluate(problem, np.array([0.5, math.log(damping), -1.0, 0.2]))
+    found, model = as_read(problem, state)
+    assert found.structure.name == model.structure == name
 
 
 def test_a_single_step_shows_no_play():

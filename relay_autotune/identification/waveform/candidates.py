@@ -215,11 +215,7 @@ class FitContext:
         :param problem: what was fitted.
         :param state: the fit.
         """
-        structure = problem.structure
-        model = structure.model_at(state.theta, state.coefficients)
-        if model is None and structure == THREE_LAGS:
-            problem = replace(problem, structure=LAG_COMPLEX)
-            model = LAG_COMPLEX.model_at(state.theta, state.coefficients)
+        problem, model = as_read(problem, state)
         if model is None:
             return None
         if self.sign * model.process_sign < 0:
@@ -556,6 +552,22 @@ def as_in(other: Problem, problem: Problem) -> Problem:
     """
     terms = {term: getattr(other, term) for term in TERMS}
     return replace(problem, structure=other.structure, **terms)
+
+
+def as_read(problem: Problem, state: Trial) -> tuple[Problem, TransferFunction | None]:
+    """Return a problem with the structure that its fit shows, and the model; None: neither is it.
+
+    Two of three lags may be a pair, and a pair two lags, which have names of their own.
+
+    :param problem: what was fitted.
+    :param state: the fit.
+    """
+    both = THREE_LAGS, LAG_COMPLEX
+    for structure in both if problem.structure in both else (problem.structure,):
+        model = structure.model_at(state.theta, state.coefficients)
+        if model is not None:
+            return replace(problem, structure=structure), model
+    return problem, None
 
 
 def likeliest_load(problem: Problem, state: Trial) -> float:
