@@ -471,9 +471,8 @@ class FitContext:
             return self.fopdt
         if known and problem.structure == UNSTABLE_FOPDT:
             return self.unstable
-        structure = problem.structure
-        state = multistart(problem, self._starts(self.guess, structure), least)
-        if structure.zero is not None:
+        state = multistart(problem, self._starts(self.guess, problem.structure), least)
+        if problem.structure.zero is not None:
             return self._beside_its_zero(problem, state, least)
         if state is not None:
             self._plain[_fitted(problem)] = state
@@ -566,7 +565,9 @@ def as_read(problem: Problem, state: Trial) -> tuple[Problem, TransferFunction |
     for structure in both if problem.structure in both else (problem.structure,):
         model = structure.model_at(state.theta, state.coefficients)
         if model is not None:
-            return replace(problem, structure=structure), model
+            # Another problem would have to compute again what this one has.
+            same = structure == problem.structure
+            return problem if same else replace(problem, structure=structure), model
     return problem, None
 
 

@@ -472,6 +472,7 @@ def _in_own_colour(context: FitContext, candidate: Candidate) -> Candidate:
     colour = _colour(candidate.problem, candidate.state)
     if colour is None:
         return candidate
+    # A term that comes out impossible in the colour stays, and has its score in white noise.
     coloured = context.near(replace(candidate.problem, colour=colour), candidate.state)
     return candidate if coloured is None else min(candidate, coloured, key=lambda c: c.score)
 
