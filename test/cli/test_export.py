@@ -556,7 +556,7 @@ def test_replay_writes_the_gains_for_the_cycle_that_the_recording_shows(tmp_path
     assert "If it runs at another period, export again with --sample-period." in text
     # What a block without a filter costs stands in the file, and is said beside it.
     (cost,) = re.findall("// (iec_61131_3_pid does worse .*)", text)
-    assert re.search(r"\d (times|%).*; it has no filter to set", cost)
+    assert re.search(r"an overshoot of \d+ % instead of \d+ %.*; it has no filter to set", cost)
     assert f"bags/step_test: {cost}" in shown.err
     # At once, before what takes seconds.
     assert replay.main([*asked[:-1], "no_such_bag"]) == 2

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from dataclasses import replace
 
@@ -140,6 +141,8 @@ def test_what_a_law_cannot_do_is_said():
     rate = tune(model, options=asked("px4_rate", 0.1, controller="pid"))
     assert rate.td == 0.0
     assert any("px4_rate does worse than a controller with filter" in w for w in rate.warnings)
+    (cost,) = tune(model, options=asked("simple_pid", 0.05, controller="pid")).warnings
+    assert re.search(r"[\d.]+ times the noise in the command.*; it has no filter to set", cost)
     rule = tune(model, rule="tyreus_luyben", options=asked("px4_rate", 0.1, controller="pid"))
     assert rule.td == 0.0
     assert rule.ms > 1.1 * tune(model, "tyreus_luyben", options=asked("simple_pid", 0.1)).ms
