@@ -58,6 +58,8 @@ class Structure:
     :param integrators: poles at s = 0.
     :param zero: parameter of its zero; None: no zero.
     :param either: True: the two lags may also be an oscillating pair, with other parameters.
+    :param with_pair: the structure that it is where its two lags are an oscillating pair, if that
+        has a name of its own.
     :param any_order: True: the number of equal lags belongs to the model, see :meth:`of_order`.
     """
 
@@ -66,6 +68,7 @@ class Structure:
     integrators: int = 0
     zero: Parameter | None = None
     either: bool = False
+    with_pair: Structure | None = None
     any_order: bool = False
 
     @cached_property
@@ -193,8 +196,7 @@ class Structure:
         :param theta: shape (m,).
         :param coefficients: those of the numerator come first, shape (k,).
         :param like: the theta that decides between lags and pair; default: ``theta``.
-        :return: None if the fit is not of this structure: no gain, a pair instead of lags, a zero
-            of the wrong sign.
+        :return: None if the fit is not of this structure: no gain, a zero of the wrong sign.
         """
         gain = float(coefficients[0])
         form = self._form_at(theta if like is None else like)
@@ -232,7 +234,7 @@ class Structure:
             if isinstance(factor, Quadratic):
                 pair = not math.exp(own[1]) >= _DAMPING_OF_A_PAIR
                 same = pair is (factor.parameters == PAIR)
-                return self if same else self.form(pair) if self.either else None
+                return self if same else self.form(pair) if self.either else self.with_pair
         return self
 
     def holds(self, model: TransferFunction) -> bool:
@@ -346,8 +348,8 @@ LAG_N_ZERO = Structure("lag_n_zero", (Lag(2),), zero=ZERO, any_order=True)
 SOPDT = Structure("sopdt", (Quadratic(),), either=True)
 SOPDT_ZERO = Structure("sopdt_zero", (Quadratic(),), zero=ZERO, either=True)
 TWO_EQUAL_ONE = Structure("two_equal_one", (Lag(2, _ONE), Lag(1, _TWO)))
-THREE_LAGS = Structure("three_lags", (Quadratic(), Lag(1, _THREE)))
 LAG_COMPLEX = Structure("lag_complex", (Quadratic(PAIR), Lag()))
+THREE_LAGS = Structure("three_lags", (Quadratic(), Lag(1, _THREE)), with_pair=LAG_COMPLEX)
 IPDT = Structure("ipdt", (), 1)
 INTEGRATOR_LAG = Structure("integrator_lag", (Lag(),), 1)
 INTEGRATOR_INVERSE = Structure("integrator_inverse", (Lag(),), 1, INVERSE)

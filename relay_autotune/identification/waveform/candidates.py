@@ -215,7 +215,7 @@ class FitContext:
         :param problem: what was fitted.
         :param state: the fit.
         """
-        problem, model = as_read(problem, state)
+        model = problem.structure.model_at(state.theta, state.coefficients)
         if model is None:
             return None
         if self.sign * model.process_sign < 0:
@@ -457,7 +457,7 @@ class FitContext:
             most = _MOST_LAGS_WITH_ZERO if row.zero else MOST_LAGS
             family = [row.of_order(n) for n in ([order] if order else range(2, most + 1))]
         else:
-            # A pair with a lag is three lags of which two are complex.
+            # Three lags of which two are complex.
             family = [THREE_LAGS if row == LAG_COMPLEX else row]
         for structure in family:
             enough = _SAMPLES_EACH * (structure.order + 4) <= self.problem.time.size
@@ -551,24 +551,6 @@ def as_in(other: Problem, problem: Problem) -> Problem:
     """
     terms = {term: getattr(other, term) for term in TERMS}
     return replace(problem, structure=other.structure, **terms)
-
-
-def as_read(problem: Problem, state: Trial) -> tuple[Problem, TransferFunction | None]:
-    """Return a problem with the structure that its fit shows, and the model; None: neither is it.
-
-    Two of three lags may be a pair, and a pair two lags, which have names of their own.
-
-    :param problem: what was fitted.
-    :param state: the fit.
-    """
-    both = THREE_LAGS, LAG_COMPLEX
-    for structure in both if problem.structure in both else (problem.structure,):
-        model = structure.model_at(state.theta, state.coefficients)
-        if model is not None:
-            # Another problem would have to compute again what this one has.
-            same = structure == problem.structure
-            return problem if same else replace(problem, structure=structure), model
-    return problem, None
 
 
 def likeliest_load(problem: Problem, state: Trial) -> float:

@@ -28,7 +28,6 @@ from relay_autotune.identification.waveform.candidates import (
     Candidate,
     FitContext,
     as_in,
-    as_read,
     drop_first_dead_time,
     nuisances_of,
 )
@@ -571,8 +570,7 @@ def _finished(
             # Samples so dense are correlated: those that were compared are not.
             own = candidate.problem
             state = refine(own, candidate.state.theta)
-    own, model = as_read(own, state)
-    if model is None:
+    if own.structure.model_at(state.theta, state.coefficients) is None:
         return None
     others = (c for c in found if c is not candidate)
     return Fit(own, state, (candidate, *others), scale)
