@@ -295,7 +295,7 @@ def _likeliest(
     :param colour: with which to begin.
     """
     n, floor = problem.y.size, problem.y.size * NEGLIGIBLE**2
-    y, best = problem.seen(problem.y), (math.inf, colour)
+    y, best = problem.y_seen, (math.inf, colour)
     rows = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), NEGLIGIBLE)
     for _ in range(_MOST_TURNS):
         whitened = replace(problem, weight=None, colour=colour)

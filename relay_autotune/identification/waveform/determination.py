@@ -68,8 +68,8 @@ def advice(found: Identification, records: Sequence[Record]) -> tuple[str, ...]:
     if missing & set(_SLOW) and not found.model.integrators:
         said += _for_slow(found, tests)
     small = missing - set(_SLOW)
-    if found.model.integrators or len(found.model.time_constants) == 1:
-        small |= missing & {"time_constant"} if found.model.integrators else set()
+    if found.model.integrators:
+        small |= missing & {"time_constant"}
     if small:
         said += _for_fast(found, sorted(small), tests)
     said += _for_noise(found, missing, tests)

@@ -318,7 +318,7 @@ class Problem:
                 by_theta[-1:] = 0.0
                 blocks.append((columns, by_theta))
         blocks += further
-        rest = self.line(time)
+        rest = self.lines[number]
         if len(blocks) == 1:
             return *blocks[0], rest
         columns = np.concatenate([b[0] for b in blocks])
@@ -347,15 +347,21 @@ class Problem:
             low, high = self.ends
             yield from (_changed(u, lambda x: x < low), is_above(u, high))
 
-    def line(self, time: FloatArray) -> FloatArray:
-        """Return the offset and, where estimated, the drift of one experiment, shape (1 or 2, n).
+    @cached_property
+    def lines(self) -> list[FloatArray]:
+        """Offset and, where estimated, drift of each experiment, shape (1 or 2, n)."""
+        found: list[FloatArray] = []
+        for time in (self.time[part] for part in self.experiments):
+            rows = np.ones((1 + self.drift, time.size))
+            if self.drift:
+                rows[1] = (time - time.mean()) / np.ptp(time)
+            found.append(rows)
+        return found
 
-        :param time: of its samples [s], shape (n,).
-        """
-        rows = np.ones((1 + self.drift, time.size))
-        if self.drift:
-            rows[1] = (time - time.mean()) / np.ptp(time)
-        return rows
+    @cached_property
+    def y_seen(self) -> FloatArray:
+        """What is fitted, as it is seen, shape (n,)."""
+        return self.seen(self.y)
 
     def seen(self, rows: FloatArray) -> FloatArray:
         """Return rows multiplied by the samples' weights, and whitened by the noise's colour.

@@ -71,7 +71,7 @@ def evaluate(problem: Problem, theta: FloatArray) -> Trial:
     :param theta: shape (m,).
     """
     columns, derivatives = problem.with_slopes(theta)
-    y, columns = problem.seen(problem.y), problem.seen(columns)
+    y, columns = problem.y_seen, problem.seen(columns)
     size = np.sqrt(np.einsum("kn,kn->k", columns, columns))
     size[size == 0.0] = 1.0
     q, r = np.linalg.qr((columns / size[:, None]).T)
@@ -120,7 +120,7 @@ def left_in_simulation(
     """
     problem = replace(problem, colour=None)
     left = left_by(problem, coefficients[: len(problem.structure.powers)], theta)
-    total = left_of(problem.seen(problem.y), problem.nuisances(theta))
+    total = left_of(problem.y_seen, problem.nuisances(theta))
     return math.sqrt(float(np.mean(left**2))), math.sqrt(float(np.mean(total**2)))
 
 

@@ -320,14 +320,14 @@ def _costs(
     """
     theta = np.array((math.log(tau), 0.0))
     along, power, total = (np.zeros(dead_times.size) for _ in range(3))
-    for part, inputs in zip(problem.experiments, problem.delayed, strict=True):
+    every = zip(problem.experiments, problem.delayed, problem.lines, strict=True)
+    for part, inputs, fixed in every:
         time, y = problem.time[part], problem.y[part]
         # A dead time only shifts a response: one pass over shifted samples gives all rows.
         moved = time - dead_times[:, None]
         response, *shifted = (
             shifted_columns(problem.structure, theta, moved, each)[0] for each in inputs
         )
-        fixed = problem.line(time)
         if problem.relaxation:
             free, _ = free_motion(problem.structure.denominator, theta, time, slopes=False)
             fixed = np.concatenate((fixed, free))
@@ -369,7 +369,8 @@ def likeliest_ends(problem: Problem) -> tuple[float, float] | None:
     levels = np.linspace(problem.levels[0], problem.levels[-1], _LEVELS + 2)[1:-1].tolist()
     ends = (-math.inf, *levels, math.inf)
     measured, answers = [], []
-    for part, u, (command, *_) in zip(few.experiments, few.inputs, few.delayed, strict=True):
+    parts = zip(few.experiments, few.inputs, few.delayed, few.lines, strict=True)
+    for part, u, (command, *_), line in parts:
         time = few.time[part]
         moved = time - dead_times[:, None]
         of_levels = (of(u, level) for of in (distance, is_above) for level in levels)
@@ -379,7 +380,6 @@ def likeliest_ends(problem: Problem) -> tuple[float, float] | None:
             for tau in taus
             for each in inputs
         ]
-        line = few.line(time)
         seen = np.concatenate((few.y[part][None], *every, line))
         if few.colour is not None:
             seen = few.colour.whitened(seen)
