@@ -83,7 +83,7 @@ def serve(loops: Sequence[Loop], options: argparse.Namespace, interrupted: list[
         return worst(*(each.result() for each in running))
 
 
-class _LoopOnPage:
+class _LoopOnPage(GainsPage):
     """One loop of a page; its tunes are shown there, and in the terminal as without a page.
 
     :param loop: the loop.
@@ -93,17 +93,15 @@ class _LoopOnPage:
     """
 
     def __init__(self, loop: Loop, page: Page, number: int, interrupted: list[int]) -> None:
-        self._loop, self._client, self._options = loop, loop.client, loop.options
-        self._page, self._number = page, number
-        self._live = page.lives[number]
+        live = page.lives[number]
+        super().__init__(
+            loop, live, page, number, lambda: live.abort.is_set() or bool(interrupted)
+        )
         # Lines of several loops must not be written over each other.
         self._terminal = Shown(sys.stderr, live=len(page.lives) == 1 and sys.stderr.isatty())
         # The context in which commands are shown as they come.
         self._commands_shown: Callable[[], AbstractContextManager[None]] = nullcontext
         self._interrupted = interrupted
-        self._gains = GainsPage(
-            loop, self._live, page, number, lambda: self._live.abort.is_set() or bool(interrupted)
-        )
         # About the running tune: messages of the cycles, K_u after each, signals or a wish to end
         # it, and what is done at its first feedback.
         self._cycles: list[Any] = []
@@ -118,14 +116,14 @@ class _LoopOnPage:
         :raises LoopError: if relay_node is lost during a tune.
         """
         status = DONE
-        self._live.tell(status="nothing is commanded before a tune is started here")
+        self.live.tell(status="nothing is commanded before a tune is started here")
         try:
             self._show_signals()
             while not self._interrupted:
-                self._client.rest(_TICK)
-                wish = self._live.next_wish()
+                self.loop.client.rest(_TICK)
+                wish = self.live.next_wish()
                 if wish is None:
-                    self._gains.look_now_and_then()
+                    self.look_now_and_then()
                 elif wish.dry:
                     self._show_plan(wish)
                 elif wish.what == START:
@@ -133,32 +131,32 @@ class _LoopOnPage:
                     status = status if tuned is None else tuned
                 else:
                     with self._commands_shown():
-                        self._gains.do(wish)
+                        self.do(wish)
         except LoopError as error:
-            self._live.tell(phase="lost", tone="bad", status=str(error))
+            self.live.tell(phase="lost", tone="bad", status=str(error))
             raise
         finally:
-            self._gains.close()
+            self.close()
         return status
 
     def _show_signals(self) -> None:
-        live = self._live
+        live = self.live
         try:
-            self._client.watch_measurement(self._hear)
-            self._commands_shown = self._client.command_watch(
+            self.loop.client.watch_measurement(self._hear)
+            self._commands_shown = self.loop.client.command_watch(
                 lambda value: live.sample("command", value), self._take_cycle
             )
         except RelayAutotuneError as error:
             live.tell(status=str(error), tone="warn")
 
     def _hear(self, value: float) -> None:
-        self._live.sample("measurement", value)
-        self._loop.answers.measured = value
+        self.live.sample("measurement", value)
+        self.loop.answers.measured = value
 
     def _take_cycle(self, cycle: Any) -> None:
         settings = cycle.settings
         middle, half = settings.baseline + settings.bias, settings.amplitude
-        self._live.tell(
+        self.live.tell(
             setpoint=settings.setpoint,
             hysteresis=settings.hysteresis,
             levels=(middle - half, middle + half),
@@ -167,20 +165,20 @@ class _LoopOnPage:
 
     def _show_plan(self, wish: PageCommand) -> None:
         """Say what a wish would do, or why it cannot be done; nothing moves."""
-        self._live.tell(phase="checking")
-        plan = self._check(wish) if wish.what == START else self._gains.plan(wish)
-        self._live.forget_questions()
-        self._live.tell(phase="idle", plan=replace(plan, number=wish.dry))
+        self.live.tell(phase="checking")
+        plan = self._check(wish) if wish.what == START else self.plan(wish)
+        self.live.forget_questions()
+        self.live.tell(phase="idle", plan=replace(plan, number=wish.dry))
 
     def _check(self, wish: PageCommand) -> PagePlan:
         """Ask whether a tune could start, and how."""
-        loop, refusal, refused, lines = self._loop, "", "", list[str]()
+        loop, refusal, refused, lines = self.loop, "", "", list[str]()
         try:
             self._take(wish)
             lines = loop.plan()
             result = loop.check()
             lines += loop.checklist(result)
-            if not self._client.succeeded:
+            if not loop.client.succeeded:
                 refusal = f"refused: {result.reason}"
                 named = (
                     reason_from_message(why).parameter
@@ -200,16 +198,16 @@ class _LoopOnPage:
         :raises RelayAutotuneError: if they cannot be.
         """
         if wish.settings:
-            self._loop.set(dict(wish.settings))
-        if lacking := self._loop.lacking():
+            self.loop.set(dict(wish.settings))
+        if lacking := self.loop.lacking():
             missing = "; ".join(lacking)
             raise SelectionError(f"fill in the plan first (Start a tune): {missing}")
-        self._loop.before_tune()
-        self._live.tell(limits=tuple(self._options.within or ()))
+        self.loop.before_tune()
+        self.live.tell(limits=tuple(self.loop.options.within or ()))
 
     def _tune(self, wish: PageCommand) -> int | None:
         """Tune until the result is there; return its exit status, None: it was not asked for."""
-        client, live = self._client, self._live
+        client, live = self.loop.client, self.live
         before = live.snapshot
         try:
             self._take(wish)
@@ -229,11 +227,11 @@ class _LoopOnPage:
         with ExitStack() as stack:
             # Only once it has begun: see TuneClient.command_watch.
             self._at_first = lambda: stack.enter_context(self._commands_shown())
-            self._loop.tune(self, self._ends, tick=_TICK)
+            self.loop.tune(self, self._ends, tick=_TICK)
             self._terminal.clear()
         if not live.snapshot.window[1]:
             live.tell(window=(live.snapshot.window[0], live.now))
-        tune = Tuned(self._loop)
+        tune = Tuned(self.loop)
         result = tune.result
         for refused in sorted(client.refused):
             say(PROGRAM, refused)
@@ -255,8 +253,8 @@ class _LoopOnPage:
             live.tell(process=self._show(result.transfer_function, cycles))
             self._add_subject(tune)
         if tune.has_gains:
-            self._loop.after_tune()
-        self._gains.look_after_tune(tune)
+            self.loop.after_tune()
+        self.look_after_tune(tune)
         if tune.left:
             # What the plant does now matters more than the tune.
             live.tell(window=())
@@ -271,10 +269,10 @@ class _LoopOnPage:
         if self._at_first is not None:
             self._at_first()
             self._at_first = None
-        snapshot, state = self._live.snapshot, STATES[feedback.state]
+        snapshot, state = self.live.snapshot, STATES[feedback.state]
         begun, ended = snapshot.window
         if state in _TONES and not ended:
-            ended = self._live.now
+            ended = self.live.now
         changed: dict[str, Any] = {
             "window": (begun, ended),
             "state": state,
@@ -289,7 +287,7 @@ class _LoopOnPage:
             changed["cycles"] = (*snapshot.cycles, line)
         if feedback.transfer_function.experiment_id:
             changed["process"] = self._show(feedback.transfer_function, feedback.cycle)
-        self._live.tell(**changed)
+        self.live.tell(**changed)
         self._terminal.take(feedback)
 
     def _show(self, message: Any, cycle: int) -> str:
@@ -310,21 +308,21 @@ class _LoopOnPage:
             # Without the first cycle it is not known where the process was at rest.
             if {0, *(c.index for c in cycles)} == set(range(len(cycles))):
                 record = record_from_cycles(cycles)
-            self._live.show("model", of_running(found, record, list(ultimate.items())))
+            self.live.show("model", of_running(found, record, list(ultimate.items())))
 
         # By another thread: this one has to hear relay_node, and who ends the tune.
-        self._page.worker.ask(show)
+        self.page.worker.ask(show)
         return process_text(found.model)
 
     def tick(self) -> None:
         """Heed what was wished or signalled."""
         # SIGHUP, as a wish that is repeated does not leave the tune alone.
-        self._ends[:] = self._interrupted or [signal.SIGHUP] * self._live.abort.is_set()
+        self._ends[:] = self._interrupted or [signal.SIGHUP] * self.live.abort.is_set()
         self._terminal.tick()
 
     def say(self, text: str) -> None:
         """Write a line that stays."""
-        self._live.tell(status=text, tone="warn")
+        self.live.tell(status=text, tone="warn")
         self._terminal.say(text)
 
     # The result of a tune.
@@ -334,8 +332,8 @@ class _LoopOnPage:
         try:
             # Asked for here: the thread that computes handles no messages.
             _, values = tune.record, tune.values
-            work = self._page.slow.ask(partial(tune.analysed, alone=True))
-            found = self._client.computed(work, lambda: bool(self._interrupted))
+            work = self.page.slow.ask(partial(tune.analysed, alone=True))
+            found = self.loop.client.computed(work, lambda: bool(self._interrupted))
         except RelayAutotuneError as error:
             say(PROGRAM, f"the gains cannot be shaped: {error}")
             return
@@ -351,27 +349,27 @@ class _LoopOnPage:
             return f"replay {shlex.quote(bag)} {flags_of({**values, **wanted})}".rstrip()
 
         def shown(found: Analysis) -> Case:
-            return replace(case_of(found, bag or self._loop.title), command=command(first))
+            return replace(case_of(found, bag or self.loop.title), command=command(first))
 
         subject = PageModel(
             shown(found),
             found.shaping,
             first,
             command,
-            self._number,
-            self._loop.target,
-            self._live.snapshot.began,
+            self.number,
+            self.loop.target,
+            self.live.snapshot.began,
         )
-        self._live.tell(tuned=self._page.add(subject))
+        self.live.tell(tuned=self.page.add(subject))
 
         def completed() -> None:
             every = shown(tune.analysed())
             known = subject.case
             subject.case = replace(every, present=known.present, proof=known.proof)
-            self._page.changed()
+            self.page.changed()
 
         # The recommended gains may be used meanwhile.
-        self._page.slow.ask(completed).add_done_callback(self._say_what_lacks)
+        self.page.slow.ask(completed).add_done_callback(self._say_what_lacks)
 
     def _say_what_lacks(self, work: Future[None]) -> None:
         ends = work.cancelled() or bool(self._interrupted)

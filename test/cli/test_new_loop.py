@@ -644,7 +644,7 @@ def test_a_plan_says_what_is_missing_or_which_answer_cannot_be_and_leaves_the_st
     live = Live("tank")
     live.tell(status="proof passed", tone="good")
     shown: Any = _LoopOnPage.__new__(_LoopOnPage)
-    shown._loop, shown._live, shown._client, shown._options = loop, live, client, loop.options
+    shown.loop, shown.live = loop, live
     shown._show_plan(PageCommand("start", dry=7))
     plan = live.snapshot.plan
     assert "present command" in plan.refusal and "command of the actuator" in plan.refusal
@@ -679,10 +679,9 @@ def test_a_plan_that_relay_node_refuses_marks_the_answer_to_change() -> None:
     given = ("--at", "5", "--within", "30", "50", "--command-within", "0", "5")
     loop = TopicLoop(client, options("--web", *given))
     shown: Any = _LoopOnPage.__new__(_LoopOnPage)
-    shown._loop, shown._client, shown._options = loop, client, loop.options
-    shown._live = Live("tank")
+    shown.loop, shown.live = loop, Live("tank")
     shown._show_plan(PageCommand("start", dry=7))
-    plan = shown._live.snapshot.plan
+    plan = shown.live.snapshot.plan
     assert plan.refusal.startswith("refused: ") and plan.refused == "at"
     assert [line[:2] for line in plan.lines] == [("note", "limits"), ("NO", "levels")]
 
@@ -691,7 +690,7 @@ def test_what_one_page_agrees_to_while_the_plan_of_another_is_looked_at_is_done(
     """It was dropped, and its page showed nothing of it."""
     live, agreed = Live("tank"), PageCommand("revert")
     shown: Any = _LoopOnPage.__new__(_LoopOnPage)
-    shown._live = live
+    shown.live = live
 
     def looked_at(wish: PageCommand) -> PagePlan:
         live.wish(agreed)
@@ -699,7 +698,7 @@ def test_what_one_page_agrees_to_while_the_plan_of_another_is_looked_at_is_done(
         live.wish(PageCommand("verify", dry=8))
         return PagePlan()
 
-    shown._gains = SimpleNamespace(plan=looked_at)
+    shown.plan = looked_at
     live.wish(PageCommand("verify", dry=9))
     shown._show_plan(PageCommand("verify", dry=7))
     assert live.next_wish() == agreed
