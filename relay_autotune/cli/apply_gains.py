@@ -64,7 +64,7 @@ _SEEN = 0.03
 # How long a verification waits until the loop is at rest [s].
 REST_WITHIN = 60.0
 # How long to look for the controller_node [s].
-_FOUND_WITHIN = 5.0
+FOUND_WITHIN = 5.0
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -127,7 +127,7 @@ def _work(options: argparse.Namespace, graph: ExitStack) -> int:
     client = graph.enter_context(GainsClient(options.namespace, options.node))
     if options.file:
         return _write(client, options)
-    client.find(_FOUND_WITHIN)
+    client.find(FOUND_WITHIN)
     if options.revert:
         if not agrees("Take the gains before back?", yes=options.yes):
             say(PROGRAM, "nothing was changed")

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from relay_autotune.cli.apply_gains import verified
+from relay_autotune.cli.apply_gains import FOUND_WITHIN, verified
 from relay_autotune.cli.loops import Loop
 from relay_autotune.cli.tuned import CONTROLLER, Proof, Tuned, gains_words
 from relay_autotune.errors import LoopError, RelayAutotuneError, TuningError
@@ -39,8 +39,6 @@ from relay_autotune.web.shape import PageModel
 from relay_autotune.web.wire import curve
 from relay_autotune_msgs.msg import PidGains
 
-# How long to look for the action of a controller_node [s].
-_FOUND_WITHIN = 5.0
 # Interval at which the gains in force are read while nothing else happens [s].
 _LOOK_EVERY = 3.0
 
@@ -171,7 +169,7 @@ class GainsPage:
         """Return the client of the running controller_node."""
         if self._controller is None:
             raise LoopError("no controller_node is in this namespace")
-        self._controller.find(_FOUND_WITHIN)
+        self._controller.find(FOUND_WITHIN)
         return self._controller
 
     # What is done.

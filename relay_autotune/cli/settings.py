@@ -316,21 +316,20 @@ class Answers:
         :param name: of the setting.
         :param value: that is given.
         """
-        if name == "within":
-            what = "the measurement is {} now"
-        elif name == "command_within":
-            what = "the present command is {}"
-        elif name == "at" and (limits := self["command_within"]):
+        if name == "amplitude":
+            return "" if value >= 0.0 else "expected at least 0"
+        if name == "at" and (limits := self["command_within"]):
             low, high = limits
             problem = f"expected a command from {low:g} to {high:g}, the limits of the actuator"
             return "" if low <= value <= high else problem
-        elif name == "amplitude":
-            return "" if value >= 0.0 else "expected at least 0"
-        else:
+        what = {
+            "within": "the measurement is {:.6g} now",
+            "command_within": "the present command is {:.6g}",
+        }.get(name)
+        seen = self._seen(name)
+        if what is None or math.isnan(seen) or value[0] <= seen <= value[1]:
             return ""
-        (low, high), seen = value, self._seen(name)
-        fine = math.isnan(seen) or low <= seen <= high
-        return "" if fine else f"{what.format(f'{seen:.6g}')}: give limits around it"
+        return f"{what.format(seen)}: give limits around it"
 
     def read(self, values: Mapping[str, Any]) -> None:
         """Take the settings that relay_node has.

@@ -153,13 +153,11 @@ def live_lines(
     lines = [f"  {paint(f'{state:<10}', _BOLD)} {bar} {100.0 * feedback.progress:3.0f} %  {times}"]
     rows = textwrap.wrap(feedback.status, width - 14, max_lines=_STATUS_LINES, placeholder=" ...")
     rows += [""] * (_STATUS_LINES - len(rows))
-    lines += [f"  {'':<10} {line}".rstrip() for line in rows]
     cycle = f"cycle {feedback.cycle}: {oscillation(feedback)}" if feedback.cycle else ""
-    lines.append(f"  {'':<10} {cycle}".rstrip())
-    lines.append(f"  {'':<10} {estimate(feedback)}".rstrip())
     model = feedback.transfer_function
     shown = process_text(transfer_function_from_message(model)) if model.experiment_id else ""
-    lines.append(f"  {'':<10} {paint(shown[: width - 14], _DIM)}".rstrip())
+    rows += [cycle, estimate(feedback), paint(shown[: width - 14], _DIM)]
+    lines += [f"  {'':<10} {row}".rstrip() for row in rows]
     return lines
 
 

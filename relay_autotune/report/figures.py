@@ -43,10 +43,10 @@ from relay_autotune.report.style import (
     SQUARE,
     VERMILLION,
     WIDE,
-    finish,
     in_steps,
     legend,
     new_figure,
+    panels,
     put_units,
     save,
     thinned,
@@ -92,7 +92,7 @@ def draw_experiment(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> 
     :param narrow: True if it is for a narrow screen.
     """
     assert case.record is not None
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.6, 1.0))
+    above, below = panels(figure, 2, 1, sharex=True, height_ratios=(2.6, 1.0))
     record, settings = case.record, case.settings
     if settings is not None:
         if settings.hysteresis > 0.0:
@@ -113,7 +113,6 @@ def draw_experiment(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> 
     below.margins(y=0.18)
     above.margins(x=0.01)
     legend(figure, columns=2 if narrow else 7)
-    finish(figure)
 
 
 def _band(settings: RelaySettings) -> tuple[float, float]:
@@ -169,7 +168,7 @@ def draw_fit(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
     """
     assert case.record is not None
     assert case.model is not None
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.3))
+    above, below = panels(figure, 2, 1, sharex=True, height_ratios=(2.2, 1.3))
     record, model = case.record, case.model
     _samples(above, record)
     above.plot(
@@ -181,7 +180,6 @@ def draw_fit(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
     below.set_xlabel("time [s]")
     above.margins(x=0.01)
     legend(figure, columns=2 if narrow else 7)
-    finish(figure)
 
 
 def _residual(axes: Axes, record: Record, model: Identification) -> None:
@@ -211,7 +209,7 @@ def draw_phase_plane(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     """
     assert case.record is not None
     assert case.limit_cycle is not None
-    axes = figure.subplots()
+    axes = panels(figure, 1, 1)
     record, cycle, settings = case.record, case.limit_cycle, case.settings
     time, y, rate = rate_of(record, record.measurement, cycle.period)
     steady = [c for c in case.cycles if c.index in cycle.cycles]
@@ -231,7 +229,6 @@ def draw_phase_plane(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     axes.set(xlabel="measurement [y]", ylabel="rate of the measurement [y/s]")
     axes.margins(0.06)
     legend(figure, columns=2 if narrow else 3)
-    finish(figure)
 
 
 def rate_of(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,9 +34,9 @@ from relay_autotune.report.style import (
     PAPER,
     SKY,
     VERMILLION,
-    finish,
     in_steps,
     legend,
+    panels,
 )
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> Non
     gains = case.best_gains
     assert gains is not None
     assert case.model is not None
-    axes = figure.subplots()
+    axes = panels(figure, 1, 1)
     loop = gains.loop(in_loop(case, case.model.model))
     w = loop_frequencies(loop)
     turn = np.exp(1j * np.linspace(0.0, 2.0 * math.pi, 181))
@@ -93,7 +93,6 @@ def draw_nyquist(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> Non
     axes.set(xlim=(-2.3, 1.3), ylim=(-2.3, 1.3), aspect="equal")
     axes.set(xlabel="real part", ylabel="imaginary part")
     legend(figure, columns=2 if narrow else 3)
-    finish(figure)
 
 
 def _margins(axes: Axes, gains: Gains, loop: ComplexArray) -> None:
@@ -176,7 +175,7 @@ def draw_bode(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
     from matplotlib.ticker import MultipleLocator, NullFormatter
 
     assert case.model is not None
-    above, below = figure.subplots(2, 1, sharex=True)
+    above, below = panels(figure, 2, 1, sharex=True)
     model = case.model.model
     w = _bode_frequencies(case)
     if case.models_around:
@@ -214,7 +213,6 @@ def draw_bode(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
     for axis in (above.xaxis, above.yaxis, below.xaxis):
         axis.set_minor_formatter(NullFormatter())
     legend(figure, columns=1 if narrow else 4)
-    finish(figure)
 
 
 def _band(axes: Axes, w: FloatArray, values: FloatArray) -> None:
@@ -240,30 +238,22 @@ _DETERMINED = 0.2
 _WIDEST = 1.0
 
 
-@dataclass(frozen=True)
-class _Row:
-    """A quantity in the figure.
+def _apart(name: str, estimate: EstimatedQuantity, centre: float) -> EstimatedQuantity:
+    """Return how far a quantity lies from a value [%], at most 100 either way.
 
-    :param name: at its row.
+    :param name: at its row of the figure.
     :param estimate: the quantity.
-    :param centre: the value from which its distance counts.
+    :param centre: the value.
     """
 
-    name: str
-    estimate: EstimatedQuantity
-    centre: float
+    def distance(value: float) -> float:
+        return 100.0 * float(np.clip(value / centre - 1.0, -_WIDEST, _WIDEST))
 
-    def ends(self) -> tuple[float, float] | None:
-        """Return the ends of the interval as distances [%]; None: not estimated."""
-        low, high = self.estimate.low, self.estimate.high
-        if not (math.isfinite(low) and math.isfinite(high)):
-            return None
-        first, last = sorted((self.distance(low), self.distance(high)))
-        return first, last
-
-    def distance(self, value: float) -> float:
-        """Return how far a value is from the centre [%], at most 100 either way."""
-        return 100.0 * float(np.clip(value / self.centre - 1.0, -_WIDEST, _WIDEST))
+    low = high = math.nan
+    if math.isfinite(estimate.low) and math.isfinite(estimate.high):
+        low, high = sorted((distance(estimate.low), distance(estimate.high)))
+    value, truth = distance(estimate.value), distance(estimate.truth)
+    return EstimatedQuantity(name, value, low, high, "%", estimate.determined, truth)
 
 
 def draw_uncertainty(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
@@ -276,15 +266,13 @@ def draw_uncertainty(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     groups = _groups(case)
     if narrow:
         sizes = [len(rows) + 2 for _, rows in groups]
-        panels = figure.subplots(len(groups), 1, height_ratios=sizes, squeeze=False)
+        parts = panels(figure, len(groups), 1, height_ratios=sizes, squeeze=False)
     else:
-        panels = figure.subplots(1, len(groups), squeeze=False)
-    for axes, (title, rows) in zip(panels.flat, groups, strict=True):
+        parts = panels(figure, 1, len(groups), squeeze=False)
+    for axes, (title, rows) in zip(parts.flat, groups, strict=True):
         _panel(axes, rows)
         axes.set_title(title, loc="left", fontsize=9.5, color=INK)
         axes.set_xlabel("distance from the estimate [%]")
-    finish(figure)
-    for axes in figure.axes:
         axes.grid(visible=False, axis="y")
         axes.tick_params(axis="y", length=0)
 
@@ -298,16 +286,16 @@ def uncertainty_height(case: Case) -> tuple[float, float]:
     return 0.95 + 0.3 * max(sizes), sum(0.9 + 0.27 * size for size in sizes)
 
 
-def _groups(case: Case) -> list[tuple[str, list[_Row]]]:
+def _groups(case: Case) -> list[tuple[str, list[EstimatedQuantity]]]:
     """Return the panels: the parameters, and K_u and w_u by each method."""
     assert case.model is not None
-    own = [_Row(e.title, e, e.value) for e in case.parameters if e.value != 0.0]
+    own = [_apart(e.title, e, e.value) for e in case.parameters if e.value != 0.0]
     found = [("parameters of the model", own)] if own else []
     for k, title in enumerate(("ultimate gain K_u by method", "ultimate frequency w_u by method")):
         if case.ultimate:
             centre = case.ultimate[k].value
             each = [(m.method, ultimate_of(m, case.truth)) for m in _each_method(case)]
-            found.append((title, [_Row(n, both[k], centre) for n, both in each if both]))
+            found.append((title, [_apart(n, both[k], centre) for n, both in each if both]))
     return found
 
 
@@ -320,23 +308,21 @@ def _each_method(case: Case) -> list[Identification]:
     return list(found.values())
 
 
-def _panel(axes: Axes, rows: Sequence[_Row]) -> None:
+def _panel(axes: Axes, rows: Sequence[EstimatedQuantity]) -> None:
     reach = 2.0
     axes.axvspan(-100.0 * _DETERMINED, 100.0 * _DETERMINED, color=GREEN, alpha=0.12, lw=0)
     axes.axvline(0.0, color=MUTED, lw=0.9)
     for k, row in enumerate(reversed(rows)):
-        estimate, at = row.estimate, row.distance(row.estimate.value)
-        colour = BLUE if estimate.determined else VERMILLION
+        colour = BLUE if row.determined else VERMILLION
         axes.axhline(k, color=GRID, lw=0.7, zorder=0.5)
-        ends = row.ends()
-        if ends is not None:
-            axes.plot(ends, [k, k], color=colour, lw=2.2, solid_capstyle="butt")
-            axes.plot(ends, [k, k], "|", color=colour, ms=8, mew=1.8)
-            reach = max(reach, 1.2 * abs(ends[0]), 1.2 * abs(ends[1]))
-        axes.plot([at], [k], "o" if estimate.determined else "X", color=colour, ms=5)
-        if math.isfinite(estimate.truth):
-            axes.plot([row.distance(estimate.truth)], [k], "*", color=INK, ms=9)
-        reach = max(reach, 1.2 * abs(at))
+        if math.isfinite(row.low):
+            axes.plot([row.low, row.high], [k, k], color=colour, lw=2.2, solid_capstyle="butt")
+            axes.plot([row.low, row.high], [k, k], "|", color=colour, ms=8, mew=1.8)
+            reach = max(reach, 1.2 * abs(row.low), 1.2 * abs(row.high))
+        axes.plot([row.value], [k], "o" if row.determined else "X", color=colour, ms=5)
+        if math.isfinite(row.truth):
+            axes.plot([row.truth], [k], "*", color=INK, ms=9)
+        reach = max(reach, 1.2 * abs(row.value))
     axes.set(xlim=(-reach, reach), ylim=(-0.6, len(rows) - 0.4))
     axes.set_yticks(range(len(rows)), [row.name for row in reversed(rows)])
 
@@ -357,7 +343,7 @@ def draw_closed_loop(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     """
     assert case.best_gains is not None
     assert case.model is not None
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1.0))
+    above, below = panels(figure, 2, 1, sharex=True, height_ratios=(1.7, 1.0))
     model = in_loop(case, case.model.model)
     half = step_duration(case.best_gains, model)
     run = simulated(case.best_gains, model, half)
@@ -368,7 +354,9 @@ def draw_closed_loop(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
                 around.time, around.measurement, color=SKY, lw=1.0, alpha=0.8,
                 label="models within the uncertainty",
             )  # fmt: skip
-    before = simulated_before(case, model, half)
+    before = None
+    if case.present is not None and case.present_does is not None:
+        before = simulated(case.present, model, half)
     if before is not None:
         dashed: Any = {"color": MUTED, "lw": 1.5, "ls": (0, (4, 2))}
         above.plot(before.time, before.measurement, label="the gains before", **dashed)
@@ -392,19 +380,6 @@ def draw_closed_loop(case: Case, figure: Figure | SubFigure, *, narrow: bool) ->
     above.set_ylim(max(low, -1.0), min(high, 2.5))
     if case.models_around or before is not None:
         legend(figure, columns=2)
-    finish(figure)
-
-
-def simulated_before(case: Case, model: TransferFunction, half: float) -> ClosedLoop | None:
-    """Return both steps with the gains before; None: they are not known, or unstable.
-
-    :param case: the experiment.
-    :param model: the process, with all dead time of the loop.
-    :param half: as of `simulated`.
-    """
-    if case.present is None or case.present_does is None:
-        return None
-    return simulated(case.present, model, half)
 
 
 def draw_rules(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
@@ -422,7 +397,7 @@ def draw_rules(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
     others = distinct_gains(case)[1:]
     columns = _columns(len(others), narrow=narrow)
     rows = -(-len(others) // columns)
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    grid = panels(figure, rows, columns, sharex=True, sharey=True, squeeze=False)
     for k, axes in enumerate(grid.flat):
         if k >= len(others):
             axes.remove()
@@ -446,7 +421,6 @@ def draw_rules(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
     # A loop that rings strongly must not set the scale for all others.
     low, high = grid[0, 0].get_ylim()
     grid[0, 0].set_ylim(max(low, -1.0), min(high, 2.5))
-    finish(figure)
 
 
 def rules_height(case: Case) -> tuple[float, float]:

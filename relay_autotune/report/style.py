@@ -14,7 +14,7 @@ import io
 import re
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -71,11 +71,16 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def finish(figure: Figure | SubFigure) -> None:
-    """Give every axes of a figure the common look.
+def panels(figure: Figure | SubFigure, rows: int, columns: int, **how: Any) -> Any:
+    """Return the axes of an empty figure, each with the common look.
 
-    :param figure: with all that is to be drawn.
+    :param figure: the figure.
+    :param rows: of axes.
+    :param columns: of axes.
+    :param how: as for `subplots` of matplotlib.
+    :return: shape (rows, columns), without an axis of length one unless ``squeeze`` is False.
     """
+    made = figure.subplots(rows, columns, **how)
     for axes in figure.axes:
         axes.set_facecolor("none")
         axes.spines[["top", "right"]].set_visible(False)
@@ -89,6 +94,7 @@ def finish(figure: Figure | SubFigure) -> None:
         for label in (axes.xaxis.label, axes.yaxis.label):
             label.set_color(INK)
             label.set_fontsize(9.5)
+    return made
 
 
 def put_units(figure: Figure, units: Mapping[str, str]) -> None:
