@@ -8,7 +8,6 @@ This module is loaded after the tune, since that takes long.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -85,12 +84,8 @@ class _Written:
 
 @dataclass
 class AfterTune(Tuned):
-    """What follows a tune in a terminal.
+    """What follows a tune in a terminal."""
 
-    :param parser: of the command line.
-    """
-
-    parser: argparse.ArgumentParser
     # What the report shows, and what a proof has found.
     _case: Case | None = None
     _proof: tuple[tuple[str, str], ...] = ()
@@ -154,7 +149,7 @@ class AfterTune(Tuned):
             ]
         again = shlex.join([PROGRAM, *options.typed])
         if loop.proves:
-            again = as_typed(PROGRAM, self.parser, options, verify=None)
+            again = as_typed(options, verify=None)
         steps = loop.again(prefix() + again)
         if result.why.code == Code.SILENT_SENSOR:
             why = reason_from_message(result.why)
@@ -262,7 +257,7 @@ class AfterTune(Tuned):
         law["export"] = None if file and Path(file).exists() else file
         # Doubtful gains are proven where a person agrees.
         law["yes"] = options.yes and not self.doubt
-        again = as_typed(PROGRAM, self.parser, options, verify=None, **law)
+        again = as_typed(options, verify=None, **law)
         return what, f"{prefix()}{again}{'' if self.doubt else ' --verify'}"
 
     def _write(self, written: _Written, file: str) -> None:

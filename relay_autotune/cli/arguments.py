@@ -60,6 +60,8 @@ _NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z|-inf|-nan")
 class Parser(argparse.ArgumentParser):
     """The command line of a command. What is wrong with it is said in one line.
 
+    The options that it parses hold it as ``parser``, see :func:`as_typed`.
+
     :param program: name of the command.
     :param others: as for :class:`argparse.ArgumentParser`.
     """
@@ -68,6 +70,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(program, formatter_class=Help, **others)
         # Without it -1e-3 is taken for an option.
         self._negative_number_matcher = _NEGATIVE
+        self.set_defaults(parser=self)
 
     def print_help(self, file: Any = None) -> None:
         """Print the help; an output that takes none is an error, which argparse would ignore.
@@ -263,21 +266,17 @@ def given_quantities(
     return given
 
 
-def as_typed(
-    program: str, parser: argparse.ArgumentParser, options: argparse.Namespace, **changed: Any
-) -> str:
+def as_typed(options: argparse.Namespace, **changed: Any) -> str:
     """Return the command line that gives some options, without those that have their defaults.
 
-    :param program: name of the command.
-    :param parser: that of the command.
-    :param options: as it parsed them.
+    :param options: as a :class:`Parser` parsed them.
     :param changed: other values of some of them, by name; None: left out.
     """
     values = vars(options) | changed
     flags: list[str] = []
     given: list[str] = []
     written = set()
-    for action in parser._actions:
+    for action in options.parser._actions:
         value = values.get(action.dest)
         if action.dest in written or value is None or value == action.default:
             continue
@@ -287,7 +286,7 @@ def as_typed(
             given += words
         else:
             flags += [action.option_strings[-1], *(words if action.nargs != 0 else [])]
-    return shlex.join([program, *given, *flags])
+    return shlex.join([options.parser.prog, *given, *flags])
 
 
 def _typed(value: Any) -> str:

@@ -539,17 +539,10 @@ def _check_joints(joints: Sequence[str], order: Sequence[str]) -> None:
         raise SelectionError(f"--joint-order {','.join(order)} names a joint twice")
 
 
-def show(
-    program: str,
-    parser: argparse.ArgumentParser,
-    options: argparse.Namespace,
-    models: Sequence[tuple[Case, Shaping | None]],
-) -> None:
+def show(options: argparse.Namespace, models: Sequence[tuple[Case, Shaping | None]]) -> None:
     """Serve a page with models to shape until Ctrl-C.
 
-    :param program: name of the command.
-    :param parser: that of the command.
-    :param options: as it parsed them.
+    :param options: as the parser of the command parsed them.
     :param models: the experiments, each with what the design of its gains takes.
     :raises SelectionError: if the address cannot be used.
     """
@@ -565,9 +558,7 @@ def show(
 
         def command(asked: DesignRequest) -> str:
             changed = asked.changed_from(first) | ({"law": None} if asked.law == "" else {})
-            return as_typed(
-                program, parser, options, web=None, web_address=None, export=None, **changed
-            )
+            return as_typed(options, web=None, web_address=None, export=None, **changed)
 
         return PageModel(
             case, shaping, first, command, target=_target_from(target, case.record, shaping)
@@ -579,4 +570,4 @@ def show(
     units = [case.units for case, _ in models]
     if all(each == units[0] for each in units):
         page.units = units[0]
-    run(page, lambda url: say(program, f"the page is at {url} until Ctrl-C"))
+    run(page, lambda url: say(options.parser.prog, f"the page is at {url} until Ctrl-C"))

@@ -86,10 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: those of the command line; default: the process's own.
     :return: the exit status.
     """
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    options = _parser().parse_args(arguments)
     options.command_line = command_line(PROGRAM, arguments)
-    return run_command(PROGRAM, lambda: _run(parser, options))
+    return run_command(PROGRAM, lambda: _run(options))
 
 
 def _parser() -> Parser:
@@ -136,7 +135,7 @@ def _count(text: str) -> int:
     return int(text)
 
 
-def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     file = None
     if options.export:
         # With --export, --output is the file of the gains.
@@ -186,7 +185,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if analyses and options.web:
         shown = as_asked([case for case in cases if case.record is not None], options)
         shapings = [analysis.shaping for analysis in analyses]
-        show(PROGRAM, parser, options, list(zip(shown, shapings, strict=True)))
+        show(options, list(zip(shown, shapings, strict=True)))
     return status
 
 

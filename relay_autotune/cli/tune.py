@@ -450,9 +450,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: those of the command line; default: the process's own.
     :return: the exit status.
     """
-    parser = _parser()
-    options = parser.parse_args(arguments)
-    return run_command(PROGRAM, lambda: _run(parser, options))
+    options = _parser().parse_args(arguments)
+    return run_command(PROGRAM, lambda: _run(options))
 
 
 def _parser() -> Parser:
@@ -503,7 +502,7 @@ def _parser() -> Parser:
     return parser
 
 
-def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     if options.output is not None and options.export is None:
         raise SelectionError("--output is for --export: say what to write")
     if options.table and options.export is not None:
@@ -532,5 +531,5 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
         say(PROGRAM, "no rule gives gains for this model")
     if options.web:
         every = found if options.table else replace(found, every=True, known=found.gains)
-        show(PROGRAM, parser, options, [(every.case(), Shaping(task))])
+        show(options, [(every.case(), Shaping(task))])
     return DONE if found.gains else NOTHING_FOUND

@@ -66,19 +66,18 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
     given = list(sys.argv[1:] if args is None else args)
     own, ros = apart(given)
-    parser = _parser()
-    options = parser.parse_args(own)
+    options = _parser().parse_args(own)
     options.typed = given
     try:
         _require_consistent(options)
         _require_no_parameter(options, ros)
         kind = kind_of(options)
     except SelectionError as error:
-        parser.refuse(str(error))
+        options.parser.refuse(str(error))
 
     def work(graph: ExitStack) -> int:
         with ExitStack() as nodes:
-            return Session(parser, options, ros, kind, graph, nodes).run()
+            return Session(options, ros, kind, graph, nodes).run()
 
     return guarded_in_graph(PROGRAM, work)
 
@@ -145,8 +144,7 @@ def _parser() -> Parser:
 class Session:
     """One run of the command, step by step: look, start, find, agree, tune, conclude.
 
-    :param parser: of the command line.
-    :param options: that it has read; answers are kept there.
+    :param options: of the command line; answers are kept there.
     :param ros: arguments for ROS.
     :param kind: of the loop.
     :param graph: where the clients end.
@@ -154,7 +152,6 @@ class Session:
     :param signals: those that end it.
     """
 
-    parser: argparse.ArgumentParser
     options: argparse.Namespace
     ros: list[str]
     kind: Kind
@@ -328,7 +325,7 @@ class Session:
         if loop.has_own_nodes and not loop.client.cancelled:
             # It came as the tune ended: nothing is asked for, or done, after that.
             self.signals.raise_if_came()
-        tune = AfterTune(loop, self.parser)
+        tune = AfterTune(loop)
         if not tune.is_started:
             self._may_start(loop, tune.result)
             return NOTHING_FOUND

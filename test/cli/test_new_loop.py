@@ -863,8 +863,7 @@ def ended(why: core.Reason, **values: Any) -> Any:
 
 def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
     words = ["--measurement", "/tank/level", "--command", "/tank/valve"]
-    parser = tune_loop._parser()
-    given = parser.parse_args(words)
+    given = tune_loop._parser().parse_args(words)
     given.typed = words
     given.at, given.within, given.command_within = 2.0, [30.0, 50.0], [0.0, 5.0]
     again = (
@@ -875,7 +874,7 @@ def test_what_is_next_repeats_the_tune_with_its_answers() -> None:
 
     def repeated(result: Any, proven: bool | None) -> list[tuple[str, str]]:
         client: Any = SimpleNamespace(result=result, record=lambda patience: inside)
-        return AfterTune(topic_loop(client, given), parser).repeated(proven)
+        return AfterTune(topic_loop(client, given)).repeated(proven)
 
     silent = ended(Code.SILENT_SENSOR(topic="/tank/level", silence=1.01))
     (what, command), (then, told) = repeated(silent, None)
@@ -915,8 +914,9 @@ def shown(
         name="relay_node", result=result, record=lambda patience: record,
         identifier_values=lambda patience: None,
     )  # fmt: skip
-    parser = tune_loop._parser()
-    given = parser.parse_args(["--measurement", "/tank/level", "--command", "/tank/valve"])
+    given = tune_loop._parser().parse_args(
+        ["--measurement", "/tank/level", "--command", "/tank/valve"]
+    )
     given.at, given.within, given.command_within = 35.0, [0.0, 90.0], [0.0, 100.0]
     words = ["-r", "__ns:=/tune_loop_1", "-r", "command:=/tank/valve", "-p", "baseline:=35.0"]
     nodes: Any = SimpleNamespace(why_lost=lambda: "")
@@ -961,7 +961,7 @@ def shown(
             loop.proves = False
             loop.apply = lambda doubt: (passed, against)  # type: ignore[method-assign]
         loop.arguments = lambda: {"relay_node": words}  # type: ignore[method-assign]
-        proven, steps = AfterTune(loop, parser).hand_over()
+        proven, steps = AfterTune(loop).hand_over()
         assert proven is passed
         assert not typed
         told = " ".join(capsys.readouterr().out.split())
@@ -1179,8 +1179,7 @@ def test_after_an_end_that_would_come_again_the_same_command_is_not_offered_agai
     why, outside, left_at, next_step
 ):
     words = ["--measurement", "/y", "--command", "/u", "--at", "1040", "--within", "3", "9"]
-    parser = tune_loop._parser()
-    given = parser.parse_args(words)
+    given = tune_loop._parser().parse_args(words)
     given.typed = words
     # The sentence lacks the values that matter to nobody here.
     result = ended(replace(why, said="it ended"))
@@ -1192,15 +1191,14 @@ def test_after_an_end_that_would_come_again_the_same_command_is_not_offered_agai
     loop = topic_loop(client, given)
     assert loop.left_its_limits is outside
     assert left_at in loop.left()
-    ((name, told),) = AfterTune(loop, parser).repeated(None)
+    ((name, told),) = AfterTune(loop).repeated(None)
     assert name == next_step
     assert ("1040" in told) == (next_step in ("run it again", "once it measures and rests"))
 
 
 def test_after_a_tune_beside_another_program_its_command_is_not_said_to_be_the_last() -> None:
     words = ["--measurement", "/y", "--command", "/u", "--at", "40", "--within", "3", "9"]
-    parser = tune_loop._parser()
-    given = parser.parse_args(words)
+    given = tune_loop._parser().parse_args(words)
     given.typed = words
     why = Code.SECOND_PUBLISHER(topic="/u", others="a node not known yet")
     client: Any = SimpleNamespace(
@@ -1209,7 +1207,7 @@ def test_after_a_tune_beside_another_program_its_command_is_not_said_to_be_the_l
     )  # fmt: skip
     loop = topic_loop(client, given)
     assert loop.left() == "the safe command 40 u was sent, but /pid commands, too, and goes on"
-    first, again = AfterTune(loop, parser).repeated(None)
+    first, again = AfterTune(loop).repeated(None)
     assert first == ("first", "end /pid, which commands /u") and again[0] == "run it again"
     assert Loop(client, given).left().startswith("the safe command was sent, but a node not known")
     # relay_node passes on what comes on controller_command as soon as a tune has ended
@@ -1254,7 +1252,7 @@ def test_a_report_is_written_again_with_the_proof_and_stays_where_none_was_made(
     loop: Any = SimpleNamespace(client=None, options=SimpleNamespace(report="tune.html"))
     proof = (("verdict", "passed"),)
     for known, made in ((case, ()), (None, proof), (case, proof)):
-        AfterTune(loop, tune_loop._parser(), known, made)._report_proof()
+        AfterTune(loop, known, made)._report_proof()
     assert written == [(proof, "tune.html")]
 
 
@@ -1270,7 +1268,7 @@ def test_a_joint_whose_model_was_cancelled_is_said_to_have_its_reference(
         client=client, options=given, has_own_nodes=True, proves=False,
         left=lambda: "the reference of left is that of before",
     )  # fmt: skip
-    assert AfterTune(loop, tune_loop._parser()).conclude() == 1
+    assert AfterTune(loop).conclude() == 1
     told = capsys.readouterr().out
     assert "the reference of left is that of before; no gains" in " ".join(told.split())
 

@@ -201,10 +201,8 @@ def test_the_command_line_that_is_shown_gives_the_same_again(tmp_path):
     parser = replay._parser()
     bag = str(REPOSITORY / "bags" / "biased_relay")
     options = parser.parse_args(["--web", "--pi", "--present", "0.4", "20", "0", bag])
-    typed = as_typed(
-        "replay", parser, options, web=None, web_address=None,
-        **vars(DesignRequest("robust", "pid", 1.62, 0.3)),
-    )  # fmt: skip
+    asked = vars(DesignRequest("robust", "pid", 1.62, 0.3))
+    typed = as_typed(options, web=None, web_address=None, **asked)
     words = shlex.split(typed)
     assert words[0] == "replay"
     again = parser.parse_args(words[1:])
