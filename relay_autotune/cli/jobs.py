@@ -182,28 +182,27 @@ def analysed(job: Job, said: list[str], working: Working | None = None) -> tuple
     :raises RelayAutotuneError: if the recording cannot be read, or lacks what is asked for.
     """
     progress = working.share if working else None
-    if job.jointly:
-        records: list[Record] = []
-        for path in job.paths:
-            recording = read_experiments(path, job.selection, progress)
-            said += [f"{path}: {note}" for note in recording.notes]
-            records += recording.experiments
-        if working is not None:
-            working.begin(map(len, records))
-        return (analyse_jointly(records, **vars(job.task)),)
-    try:
-        recording = read_experiments(job.paths, job.selection, progress)
-    except NotThereError as error:
-        if not job.among_others:
-            raise
-        said.append(f"{error.lacking}: it is read by its own names")
-        own = replace(job.selection, measurement=None, command=None, time=None)
-        recording = read_experiments(job.paths, own, progress)
-    said += [f"{job.name}: {note}" for note in recording.notes]
+    records: list[Record] = []
+    # Those of one process are read one by one, others are one timeline.
+    groups = [(path,) for path in job.paths] if job.jointly else [job.paths]
+    for paths in groups:
+        try:
+            recording = read_experiments(paths, job.selection, progress)
+        except NotThereError as error:
+            if not job.among_others:
+                raise
+            said.append(f"{error.lacking}: it is read by its own names")
+            own = replace(job.selection, measurement=None, command=None, time=None)
+            recording = read_experiments(paths, own, progress)
+        name = paths[0] if job.jointly else job.name
+        said += [f"{name}: {note}" for note in recording.notes]
+        records += recording.experiments
     if working is not None:
-        working.begin(map(len, recording.experiments))
+        working.begin(map(len, records))
+    if job.jointly:
+        return (analyse_jointly(records, **vars(job.task)),)
     tell = working.at if working else lambda _: None
-    found = tuple(analyse(each, **vars(job.task), tell=tell) for each in recording.experiments)
+    found = tuple(analyse(each, **vars(job.task), tell=tell) for each in records)
     return agreed(found) if recording.of_one_process else found
 
 

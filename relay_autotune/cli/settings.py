@@ -411,7 +411,7 @@ class Answers:
             yield {
                 "name": name,
                 "question": setting.question,
-                "unit": SETTING[name].unit,
+                "unit": setting.unit,
                 "values": value if setting.ends > 1 else [value],
                 "ends": setting.ends,
                 # The form holds the present command itself.

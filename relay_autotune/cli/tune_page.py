@@ -54,6 +54,8 @@ from relay_autotune.web.wire import of_running
 
 # How long messages are handled before wishes are looked at [s].
 _TICK = 0.05
+# What the page shows of each feedback as it is.
+_SHOWN = ("status", "progress", "elapsed", "remaining")
 _TONES = {"completed": "good", "aborted": "bad", "failed": "bad"}
 
 
@@ -277,10 +279,7 @@ class _LoopOnPage(GainsPage):
             "window": (begun, ended),
             "state": state,
             "tone": _TONES.get(state, ""),
-            "status": feedback.status,
-            "progress": feedback.progress,
-            "elapsed": feedback.elapsed,
-            "remaining": feedback.remaining,
+            **{name: getattr(feedback, name) for name in _SHOWN},
         }
         if feedback.cycle > len(snapshot.cycles):
             line = cycle_line(f"cycle {feedback.cycle}", feedback)

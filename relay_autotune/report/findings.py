@@ -162,12 +162,8 @@ def repeats_of(case: Case) -> tuple[tuple[str, str], ...]:
     found = [("The same report:", case.command)] if case.command else []
     relay = case.settings
     if relay is not None and relay.amplitude > 0.0:
-        values = {
-            "amplitude": relay.amplitude,
-            "baseline": relay.baseline,
-            "bias": relay.bias,
-            "hysteresis": relay.hysteresis,
-        }
+        names = ("amplitude", "baseline", "bias", "hysteresis")
+        values = {name: getattr(relay, name) for name in names}
         # ROS reads 1 as an integer, and refuses it for a number
         given = " ".join(
             f"-p {name}:={float(f'{value:.6g}')!r}"

@@ -49,6 +49,8 @@ _ISA = {
     "tf": "filter of the measurement",
     "b": "weight of the set-point",
 }
+# The parts of both steps that are drawn.
+_CURVES = ("time", "measurement", "command", "low", "high")
 
 
 def to_text(document: dict[str, Any]) -> str:
@@ -191,11 +193,7 @@ def of_shaped(subject: PageModel, shaped: DesignResult) -> dict[str, Any]:
         "b": gains.b,
         "ms": gains.ms,
         "steps": {
-            "time": short(steps.time),
-            "measurement": short(steps.measurement),
-            "command": short(steps.command),
-            "low": short(steps.low),
-            "high": short(steps.high),
+            **{name: short(getattr(steps, name)) for name in _CURVES},
             "load": digits(steps.load, 3),
             "load_time": steps.load_time,
         },
