@@ -184,8 +184,7 @@ class GainsPage:
             self._do(wish)
         except RelayAutotuneError as error:
             live.rest(str(error), good=False)
-        if live.snapshot.window[1:] == (0.0,):
-            live.tell(window=(live.snapshot.window[0], live.now))
+        live.end_window()
         # Limits and gains may be others at the next wish.
         self._known = None
         self.look()

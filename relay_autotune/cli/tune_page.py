@@ -231,8 +231,7 @@ class _LoopOnPage(GainsPage):
             self._at_first = lambda: stack.enter_context(self._commands_shown())
             self.loop.tune(self, self._ends, tick=_TICK)
             self._terminal.clear()
-        if not live.snapshot.window[1]:
-            live.tell(window=(live.snapshot.window[0], live.now))
+        live.end_window()
         tune = Tuned(self.loop)
         result = tune.result
         for refused in sorted(client.refused):
@@ -272,11 +271,9 @@ class _LoopOnPage(GainsPage):
             self._at_first()
             self._at_first = None
         snapshot, state = self.live.snapshot, STATES[feedback.state]
-        begun, ended = snapshot.window
-        if state in _TONES and not ended:
-            ended = self.live.now
+        if state in _TONES:
+            self.live.end_window()
         changed: dict[str, Any] = {
-            "window": (begun, ended),
             "state": state,
             "tone": _TONES.get(state, ""),
             **{name: getattr(feedback, name) for name in _SHOWN},

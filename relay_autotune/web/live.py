@@ -185,6 +185,11 @@ class Live:
         self._taken = None
         self.tell(phase="idle", status=status, tone="good" if good else "bad", **changed)
 
+    def end_window(self) -> None:
+        """Tell that what the figures show has ended now, if it had not before."""
+        if self._snapshot.window[1:] == (0.0,):
+            self.tell(window=(self._snapshot.window[0], self.now))
+
     def show(self, name: str, document: Any) -> None:
         """Show curves that change seldom.
 
