@@ -139,14 +139,13 @@ SETTINGS = (
     ),
     Setting("json", False, loops=_COMMAND).means("print the result as JSON"),
     Setting(
-        "amplitude", 0.0, "u", 0.0, example="0", parameters=("amplitude",), loops=_COMMAND,
+        "amplitude", 0.0, "u", 0.0, parameters=("amplitude",), loops=_COMMAND,
         question="half the distance of the relay's two commands; 0: found by the tune",
     ).means("half the distance of the two commands [u]; default: the node's parameter"),
     Setting("measurement", "", metavar="TOPIC", loops=_COMMANDING).means("topic that measures"),
     Setting("command", "", metavar="TOPIC").means("topic that commands the actuator"),
     Setting(
-        "field", "data", metavar="PATH", question="the number that measures",
-        parameters=("measurement_field",), loops=_COMMANDING,
+        "field", "data", metavar="PATH", parameters=("measurement_field",), loops=_COMMANDING
     ).means("the number in the messages of --measurement (%(default)s)"),
     Setting("command_field", "data", metavar="PATH", parameters=("command_field",)).means(
         "the number in the messages of --command, such as linear.x"
