@@ -57,7 +57,6 @@ from relay_autotune.bag.mcap_records import (
     sorted_records,
 )
 from relay_autotune.bag.source import (
-    MAGIC,
     SQLITE_MAGIC,
     ZSTD_MAGIC,
     DamageError,
@@ -70,7 +69,7 @@ from relay_autotune.errors import BagError, visible
 _EXPANDED = 16 << 20
 
 
-class BagFile:
+class BagFile(Source):
     """A file of a bag, open for reading.
 
     :param path: the file; it may be compressed as a whole with zstd.
@@ -78,42 +77,19 @@ class BagFile:
     :raises BagError: if it is missing, unreadable, empty or something else.
     """
 
-    _magic = MAGIC
-    """The bytes with which it has to begin."""
-
     def __init__(self, path: Path, largest_chunk: int = LARGEST_CHUNK) -> None:
-        self.path = path
         self.channels: dict[int, Channel] = {}
         self.metadata: list[tuple[str, dict[str, str]]] = []
         self.message_counts: dict[int, int] = {}
         """How many messages of each channel the file says it has, where it says so."""
-        self._source = Source(path, self._magic, largest_chunk)
-        self.notes = [*self._source.notes]
         self._refused: set[int] = set()
-        try:
-            self._open()
-        except BaseException:
-            self.close()
-            raise
+        super().__init__(path, largest_chunk)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *raised: object) -> None:
         self.close()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._source.close()
-
-    @property
-    def size(self) -> int:
-        """Size of the file, expanded if it is compressed as a whole [bytes]."""
-        return self._source.size
-
-    def _open(self) -> None:
-        """Learn what the file holds."""
-        raise NotImplementedError
 
     def read(self, channels: Collection[int]) -> Iterator[tuple[int, int, Messages]]:
         """Yield the messages of some channels, a run of them at a time.
@@ -149,14 +125,14 @@ class BagFile:
         decompressor = zstandard.ZstdDecompressor()
         parts: list[bytes] = []
         kept: list[int] = []
-        size, refusal, largest = 0, "", self._source.largest
+        size, refusal, largest = 0, "", self.largest
         for number, frame in enumerate(messages.payloads()):
             try:
                 part = _expanded(zstandard, decompressor, frame, largest)
             except (DamageError, zstandard.ZstdError, MemoryError) as damage:
                 refusal = refusal or str(damage)
                 continue
-            self._source.count_expanded(len(part))
+            self.count_expanded(len(part))
             parts.append(part)
             kept.append(number)
             size += len(part)
@@ -233,7 +209,7 @@ class McapFile(BagFile):
     """An MCAP file open for reading; a chunk that declares more than is allowed is left out."""
 
     def _open(self) -> None:
-        self._layout = layout = layout_by_summary(self._source) or scan(self._source)
+        self._layout = layout = layout_by_summary(self) or scan(self)
         self.channels = layout.declared.channels
         self.metadata = layout.declared.metadata
         self.message_counts = layout.declared.message_counts or {}
@@ -252,11 +228,11 @@ class McapFile(BagFile):
         # An index that leads to fewer messages than there are, or to more, chooses no chunk.
         trusted = counts is not None and index.lists(wanted, counts)
         chosen = index.holding(wanted if trusted else None)
-        self._source.announce((segment.start, segment.index_end) for segment in chosen)
+        self.announce((segment.start, segment.index_end) for segment in chosen)
         # Only the chunks that will be read are checked: on a disk each check takes time.
-        if all(record_at(self._source, s.start, s.end) == (Opcode.CHUNK, s.end) for s in chosen):
+        if all(record_at(self, s.start, s.end) == (Opcode.CHUNK, s.end) for s in chosen):
             return chosen
-        self._layout = scan(self._source)
+        self._layout = scan(self)
         for note in self._layout.notes:
             self._note(note)
         found = self._layout.declared.channels
@@ -283,7 +259,7 @@ class McapFile(BagFile):
             for size, found in self._messages(pieces, wanted):
                 for channel, messages in found.items():
                     counts[channel] += messages.begin.size
-                    self._source.count_messages(counts[channel])
+                    self.count_messages(counts[channel])
                     for part in self._as_sent(channel, messages, f" of {self._name(channel)}"):
                         yield channel, before, part
                 before += size + RECORD.size
@@ -309,14 +285,14 @@ class McapFile(BagFile):
         size = 0
         for segment in self.segments(wanted):
             try:
-                content = segment_content(self._source, segment)
+                content = segment_content(self, segment)
             except DamageError as damage:
-                self._note(damage_note(self._source, segment, damage))
+                self._note(damage_note(self, segment, damage))
                 continue
             if batch and size + len(content) > _BATCH:
                 yield batch
                 batch, size = [], 0
-            indexes = self._source.read(segment.end, segment.index_end)
+            indexes = self.span(segment.end, segment.index_end)
             batch.append(_Piece(segment, content, indexed_offsets(indexes)))
             size += len(content)
             if size >= _BATCH:
@@ -339,13 +315,13 @@ class McapFile(BagFile):
             )
         if found is None:
             offsets, end = record_offsets(content)
-            self._source.count_messages(offsets.size - MOST_DECLARATIONS)
+            self.count_messages(offsets.size - MOST_DECLARATIONS)
             if len(pieces) > 1 and not bool(np.isin(begins, np.append(offsets, end)).all()):
                 # One of them does not end with a record.
                 return [found for piece in pieces for found in self._messages([piece], wanted)]
             if end != len(content) and pieces[0].segment.whole:
                 damage = DamageError(f"a record of impossible length at {end}")
-                self._note(damage_note(self._source, pieces[0].segment, damage))
+                self._note(damage_note(self, pieces[0].segment, damage))
             found = sorted_records(content, offsets, wanted, self.channels)
             self._check(content, found)
             for piece, begin, stop in zip(pieces, begins[:-1], begins[1:], strict=True):
@@ -436,7 +412,7 @@ class SqliteFile(BagFile):
             )
         try:
             self._database = self._connected()
-            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, self._source.largest)
+            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, self.largest)
             self._database.text_factory = lambda text: text.decode("utf-8", "replace")
             # A file may define views, functions and trees of pages that never end.
             self._database.execute("PRAGMA trusted_schema = OFF")
@@ -459,7 +435,7 @@ class SqliteFile(BagFile):
         return self._steps > MOST_STEPS_OF_SQLITE + STEPS_OF_SQLITE_PER_BYTE * self.size
 
     def _connected(self) -> sqlite3.Connection:
-        descriptor = self._source.fileno()
+        descriptor = self._file.fileno()
         if os.fstat(descriptor).st_nlink:
             # By its descriptor: what was checked is what is read. Nothing is written to it.
             return sqlite3.connect(
@@ -467,7 +443,7 @@ class SqliteFile(BagFile):
             )
         # What was expanded has no name by which SQLite could open it.
         database = sqlite3.connect(":memory:")
-        database.deserialize(self._source.read(0, self.size))
+        database.deserialize(self.span(0, self.size))
         return database
 
     def _declared(self) -> dict[int, Channel]:
@@ -562,19 +538,15 @@ class SqliteFile(BagFile):
     def _runs(
         self, rows: list[tuple[int, int, bytes]], before: int
     ) -> Iterator[tuple[int, int, Messages]]:
-        by_channel: dict[int, list[tuple[int, tuple[int, int, bytes]]]] = {}
-        for k, row in enumerate(rows):
-            by_channel.setdefault(row[0], []).append((k, row))
-        for channel, own in by_channel.items():
-            end = np.cumsum([len(row[2]) for _, row in own], dtype=np.int64)
-            time: Any = np.array([row[1] for _, row in own], dtype=np.int64)
-            messages = Messages(
-                b"".join(row[2] for _, row in own),
-                np.array([k for k, _ in own], dtype=np.int64),
-                time,
-                time,
-                np.append(0, end[:-1]),
-                end,
-            )
+        places: dict[int, list[int]] = {}
+        for k, (topic, _, _) in enumerate(rows):
+            places.setdefault(topic, []).append(k)
+        end = np.cumsum([len(data) for _, _, data in rows], dtype=np.int64)
+        begin = np.append(0, end[:-1])
+        time: IntArray = np.array([time for _, time, _ in rows], dtype=np.int64)
+        content = b"".join(data for _, _, data in rows)
+        for channel, own in places.items():
+            at = np.array(own, dtype=np.int64)
+            messages = Messages(content, at, time[at], time[at], begin[at], end[at])
             for part in self._as_sent(channel, messages):
                 yield channel, before, part

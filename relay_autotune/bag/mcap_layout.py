@@ -126,7 +126,7 @@ class Layout:
         if opcode in (Opcode.METADATA, Opcode.STATISTICS):
             if end - begin > LARGEST_SUMMARY:
                 raise DamageError(f"a record of {end - begin} bytes")
-            self.declared.take(opcode, source.read(begin + RECORD.size, end))
+            self.declared.take(opcode, source.span(begin + RECORD.size, end))
 
     def holding(self, channels: frozenset[int]) -> list[Segment]:
         """Return the segments that hold messages of some channels, where it was gone through."""
@@ -146,9 +146,9 @@ def segment_content(source: Source, segment: Segment) -> Content:
             f"the {largest} that --max-chunk allows"
         )
     if not segment.is_chunk:
-        return source.read(begin, end)
+        return source.span(begin, end)
     # Without its head, by which the content of a plain chunk is aligned.
-    body = source.read(begin + RECORD.size, end)
+    body = source.span(begin + RECORD.size, end)
     whole = segment.whole and len(body) == end - begin - RECORD.size
     chunk = parsed("Chunk", body, whole=whole)
     size, crc = chunk.uncompressed_size, chunk.uncompressed_crc
@@ -196,7 +196,7 @@ def _expand(data: memoryview, compression: str, size: int) -> bytes | memoryview
 
 def record_at(source: Source, position: int, stop: int) -> tuple[int, int] | None:
     """Return opcode and end of the record at a place; None: none that ends up to another place."""
-    head = source.read(position, min(position + RECORD.size, stop))
+    head = source.span(position, min(position + RECORD.size, stop))
     if len(head) < RECORD.size:
         return None
     opcode, length = RECORD.unpack(head)
@@ -238,8 +238,8 @@ class _Scan:
                     self.layout.take(source, opcode, position, end)
             ended |= opcode in (Opcode.DATA_END, Opcode.FOOTER)
             position = end
-        if not ended or source.read(source.size - len(MAGIC), source.size) != MAGIC:
-            if source.read(position, position + 1) == bytes([Opcode.CHUNK]):
+        if not ended or source.span(source.size - len(MAGIC), source.size) != MAGIC:
+            if source.span(position, position + 1) == bytes([Opcode.CHUNK]):
                 self._look_inside(Segment(position, source.size, whole=False))
             self._tell_tear()
         return self.layout
@@ -294,7 +294,7 @@ def scan(source: Source) -> Layout:
 def layout_by_summary(source: Source) -> Layout | None:
     """Return channels and chunks as the summary has them; None if there is none to trust."""
     foot = source.size - len(MAGIC) - _FOOTER_SIZE
-    tail = source.read(foot, source.size) if foot >= len(MAGIC) else b""
+    tail = source.span(foot, source.size) if foot >= len(MAGIC) else b""
     head = RECORD.pack(Opcode.FOOTER, _FOOTER_SIZE - RECORD.size)
     if tail[: RECORD.size] != head or tail[_FOOTER_SIZE:] != MAGIC:
         return None
@@ -302,7 +302,7 @@ def layout_by_summary(source: Source) -> Layout | None:
     start, crc = footer.summary_start, footer.summary_crc
     if not len(MAGIC) <= start < foot or foot - start > LARGEST_SUMMARY:
         return None
-    summary = source.read(start, foot)
+    summary = source.span(start, foot)
     # The checksum covers the summary and the footer up to the checksum itself.
     if crc and crc != zlib.crc32(tail[: _FOOTER_SIZE - 4], zlib.crc32(summary)):
         return None

@@ -85,30 +85,30 @@ class Source:
     where a mapping would end this process.
 
     :param path: the file; it may be compressed as a whole with zstd.
-    :param magic: the bytes with which it has to begin.
-    :param largest: size that a chunk, or a message outside of chunks, may have [bytes].
+    :param largest_chunk: size that a chunk, or a message outside of chunks, may have [bytes].
     :raises BagError: if it is missing, unreadable, empty or something else.
     """
 
-    def __init__(self, path: Path, magic: bytes = MAGIC, largest: int = LARGEST_CHUNK) -> None:
-        self.path, self.largest = path, largest
+    _magic = MAGIC
+    """The bytes with which it has to begin."""
+
+    def __init__(self, path: Path, largest_chunk: int = LARGEST_CHUNK) -> None:
+        self.path, self.largest = path, largest_chunk
         self.notes: list[str] = []
         self._expanded = 0
-        self._magic = magic
-        self._kind = "an MCAP file" if magic == MAGIC else "a rosbag2 file in SQLite"
         self._file = open_regular(path)
         try:
-            if self.read(0, len(ZSTD_MAGIC)) == ZSTD_MAGIC:
+            if self.span(0, len(ZSTD_MAGIC)) == ZSTD_MAGIC:
                 self._expand()
             self.look_again()
             self._check_start()
+            self._open()
         except BaseException:
             self.close()
             raise
 
-    def fileno(self) -> int:
-        """Return the descriptor of the open file."""
-        return self._file.fileno()
+    def _open(self) -> None:
+        """Learn what the file holds."""
 
     def look_again(self) -> None:
         """Update the size of the file, which may have grown or shrunk."""
@@ -118,7 +118,7 @@ class Source:
         """Close the file."""
         self._file.close()
 
-    def read(self, start: int, stop: int) -> bytes:
+    def span(self, start: int, stop: int) -> bytes:
         """Return the bytes between two places; fewer if the file ends before.
 
         :raises BagError: if the file system refuses.
@@ -178,7 +178,8 @@ class Source:
                 os.posix_fadvise(self._file.fileno(), start, length, os.POSIX_FADV_WILLNEED)
 
     def _check_start(self) -> None:
-        start = self.read(0, 16)
+        kind = "an MCAP file" if self._magic == MAGIC else "a rosbag2 file in SQLite"
+        start = self.span(0, 16)
         if not start and self.notes:
             raise BagError(f"{self.path} is not a recording: {self.notes[0]}")
         if not start:
@@ -188,14 +189,12 @@ class Source:
             )
         if start[: len(self._magic)] != self._magic[: len(start)]:
             known = (*_OTHERS, *_TABLES)
-            kind = next((what for head, what in known if start.startswith(head)), None)
-            found = f"it is {kind}" if kind else f"it begins with {start[:8]!r}"
-            raise BagError(
-                f"{self.path} is not {self._kind}: {found}; expected a bag or a CSV table"
-            )
+            other = next((what for head, what in known if start.startswith(head)), None)
+            found = f"it is {other}" if other else f"it begins with {start[:8]!r}"
+            raise BagError(f"{self.path} is not {kind}: {found}; expected a bag or a CSV table")
         if len(start) < len(self._magic):
             raise BagError(
-                f"{self.path} holds only the first {len(start)} bytes of {self._kind}; "
+                f"{self.path} holds only the first {len(start)} bytes of {kind}; "
                 f"nothing was recorded in it"
             )
 
