@@ -77,9 +77,8 @@ class _Parser:
                 self._tokens.append(match.group())
             at = match.end()
         self._at = 0
-        self._found: dict[str, Fields] = {}
-        self._named: dict[str, Type] = {}
-        self._sizes: dict[str, int] = {}
+        # Structures by their fields, names of types, and sizes.
+        self._known: dict[str, Fields | Type | int] = {}
 
     def types(self) -> dict[str, Fields]:
         """Return the fields of each type, by its name.
@@ -88,7 +87,7 @@ class _Parser:
         """
         while self._at < len(self._tokens):
             self._definition(())
-        return self._found
+        return {name: what for name, what in self._known.items() if isinstance(what, tuple)}
 
     # --- words
 
@@ -120,7 +119,7 @@ class _Parser:
         what = self._word()
         if what == "typedef":
             for alias, kind in self._declared(scope):
-                self._named["/".join((*scope, alias))] = kind
+                self._known["/".join((*scope, alias))] = kind
             return
         if what == "const":
             self._type(scope, 0)
@@ -130,7 +129,7 @@ class _Parser:
             self._take("=")
             value = self._take()
             if value.isdecimal() and self._peek() == ";":
-                self._sizes[name] = _size(value)
+                self._known[name] = _size(value)
             while self._peek() != ";":
                 self._take()
         elif what == "module":
@@ -144,9 +143,9 @@ class _Parser:
             self._take("{")
             while not self._accept("}"):
                 fields += self._declared(scope)
-            self._found[name] = tuple(fields)
+            self._known[name] = tuple(fields)
         elif what == "enum":
-            self._named[name] = NUMBERS["uint32"]
+            self._known[name] = NUMBERS["uint32"]
             self._take("{")
             while self._take() != "}":
                 pass
@@ -179,27 +178,22 @@ class _Parser:
         token = self._peek()
         if token.isdecimal():
             return _size(self._take())
-        name = self._resolved(self._scoped(), scope, self._sizes)
-        if name not in self._sizes:
+        name = self._scoped(scope)
+        size = self._known.get(name)
+        if not isinstance(size, int):
             raise ValueError(f"{name[:60]!r} is not a size")
-        return self._sizes[name]
+        return size
 
     # --- types
 
-    def _scoped(self) -> str:
+    def _scoped(self, scope: tuple[str, ...]) -> str:
+        """Take a name; return the full one of what is known by it from a scope on outwards."""
         self._accept("::")
         parts = [self._word()]
         while self._accept("::"):
             parts.append(self._word())
-        return "/".join(parts)
-
-    def _resolved(self, name: str, scope: tuple[str, ...], known: Mapping[str, object]) -> str:
-        """Return the full name of what is known by a name from a scope on outwards."""
-        for depth in range(len(scope), -1, -1):
-            full = "/".join((*scope[:depth], name))
-            if full in known:
-                return full
-        return name
+        full = ["/".join((*scope[:depth], *parts)) for depth in range(len(scope), -1, -1)]
+        return next((name for name in full if name in self._known), full[-1])
 
     def _type(self, scope: tuple[str, ...], depth: int) -> Type:
         if depth > DEEPEST_TYPE:
@@ -227,11 +221,9 @@ class _Parser:
             return NUMBERS[_NUMBERS[word]]
         if word in _NUMBERS:
             return NUMBERS[_NUMBERS[self._take()]]
-        name = self._scoped()
-        full = self._resolved(name, scope, self._named)
-        if full in self._named:
-            return self._named[full]
-        return Struct(self._resolved(name, scope, self._found))
+        name = self._scoped(scope)
+        found = self._known.get(name)
+        return found if isinstance(found, Type) else Struct(name)
 
 
 def _size(digits: str) -> int:
