@@ -110,6 +110,8 @@ class TextTable:
         # Line and text of the first number with a decimal comma, and of the first with a point.
         self._comma: tuple[int, str] | None = None
         self._point: tuple[int, str] | None = None
+        # The units behind the numbers of each column.
+        self._behind: dict[int, str] = {}
         self._head: list[str] = []
         self._waiting: list[tuple[int, list[str]]] = []
         self.units: dict[str, str] = {}
@@ -247,7 +249,6 @@ class TextTable:
         """
         times = Times()
         values: list[list[float]] = [[] for _ in places]
-        suffixes: list[str | None] = [None] * len(places)
         lines: list[int] = []
         untimed, damaged = 0, []
         for line, row in self._rows():
@@ -256,7 +257,7 @@ class TextTable:
                 untimed += 1
                 continue
             try:
-                found = self._numbers(line, row, places, suffixes)
+                found = [self._value(line, row, at) for at in places]
                 if time is not None:
                     self._stamp(line, time, stamp, times)
             except BagError as error:
@@ -294,24 +295,13 @@ class TextTable:
         self.lines = np.array(lines, dtype=np.int64)
         return times, [np.array(column) for column in values]
 
-    def _numbers(
-        self, line: int, row: list[str], places: Sequence[int], suffixes: list[str | None]
-    ) -> list[float]:
-        """Return the numbers of a row at some places; NaN: an empty cell.
-
-        :param suffixes: the units behind the numbers of each place so far, which stay the same.
-        """
-        found = []
-        for k, at in enumerate(places):
-            cell = row[at] if at < len(row) else ""
-            number, suffix = self._number(line, at, cell)
-            found.append(number)
-            if math.isnan(number):
-                continue
-            if suffixes[k] not in (None, suffix):
-                raise self._no_number(line, at, cell)
-            suffixes[k] = suffix
-        return found
+    def _value(self, line: int, row: list[str], at: int) -> float:
+        """Return the number of a row at a place, whose unit stays the same; NaN: an empty cell."""
+        cell = row[at] if at < len(row) else ""
+        number, unit = self._number(line, at, cell)
+        if not math.isnan(number) and self._behind.setdefault(at, unit) != unit:
+            raise self._no_number(line, at, cell)
+        return number
 
     def _stamp(self, line: int, at: int, cell: str, times: Times) -> None:
         date = None if _is_number(cell) else _date(cell)
