@@ -40,37 +40,24 @@ _MOST_LEVELS = 12
 _FEWEST_SAMPLES = 10
 
 
-@dataclass(frozen=True)
-class Character:
-    """What a signal looks like.
-
-    :param kind: ``empty``, ``constant``, ``two-level``, ``steps`` or ``varies``.
-    :param text: the same as text.
-    """
-
-    kind: str
-    text: str
-
-
 # Names of a measurement and of a command that may belong to one loop, and why.
 Pair = tuple[str, str, str]
 
 
-def characterise(signal: Signal) -> Character:
-    """Return what a signal looks like, by its values alone."""
+def look_of(signal: Signal) -> tuple[int, str]:
+    """Return how many finite values a signal takes, and what it looks like, as text."""
     n = len(signal)
+    levels = int(np.unique(signal.values[np.isfinite(signal.values)]).size)
     if n == 0:
-        return Character("empty", "no messages")
-    finite = signal.values[np.isfinite(signal.values)]
-    levels = np.unique(finite).size
-    switches = int(np.count_nonzero(np.diff(signal.values)))
+        return levels, "no messages"
     if levels <= 1:
-        return Character("constant", f"constant in {n} messages")
+        return levels, f"constant in {n} messages"
     if levels == 2:
-        return Character("two-level", f"two levels, {switches} switches in {n} messages")
+        switches = int(np.count_nonzero(np.diff(signal.values)))
+        return levels, f"two levels, {switches} switches in {n} messages"
     if levels <= _MOST_LEVELS:
-        return Character("steps", f"steps between {levels} levels in {n} messages")
-    return Character("varies", f"varies over {levels} values in {n} messages")
+        return levels, f"steps between {levels} levels in {n} messages"
+    return levels, f"varies over {levels} values in {n} messages"
 
 
 def role_by_name(name: str) -> str | None:
@@ -139,7 +126,7 @@ def _only(topics: Topics, pairs: Sequence[Pair]) -> tuple[tuple[str, str], list[
             [(flags_of(y, u), reason) for y, u, reason in pairs],
         )
     # More pairs than topics: the names say too little, and the topics are the shorter list.
-    looks = {name: characterise(t.signal).text for name, t in topics.signals().items()}
+    looks = {name: look_of(timed.signal)[1] for name, timed in topics.signals().items()}
     number = f"{len(pairs)} pairs" if pairs else "no pair"
     raise SelectionError(
         f"{topics.path} holds no recorded experiment and {number} of topics that may be "
@@ -161,41 +148,45 @@ def plausible_pairs(
     :param measurement: name of the measurement that the user chose, which may look like anything.
     :param command: name of the command that the user chose.
     """
-    looks = {signal.name: characterise(signal) for signal in signals}
+    looks = {signal.name: look_of(signal) for signal in signals}
     found = []
     for y, u in itertools.permutations(signals, 2):
         names = (y.name, u.name)
+        (of_y, look_of_y), (of_u, look_of_u) = (looks[name] for name in names)
         if measurement not in (None, names[0]) or command not in (None, names[1]):
             continue
         if (
-            (names[0] == measurement or _may_be_measurement(y, looks[names[0]].kind))
-            and (names[1] == command or _may_be_command(u, *(looks[name].kind for name in names)))
+            (names[0] == measurement or _may_be_measurement(y, of_y))
+            and (names[1] == command or _may_be_command(u, of_y, of_u))
             and _overlap(y, u)
         ):
             named = (role_by_name(names[0]) == "measurement") + (
                 role_by_name(names[1]) == "command"
             )
             together = _namespace(names[0]) == _namespace(names[1])
-            reason = "; ".join(f"{name} {looks[name].text}" for name in names)
+            reason = f"{names[0]} {look_of_y}; {names[1]} {look_of_u}"
             found.append(((named, together), (*names, reason)))
     best = max((rank for rank, _ in found), default=None)
     return [pair for rank, pair in found if rank == best]
 
 
-def _may_be_measurement(signal: Signal, kind: str) -> bool:
+def _may_be_measurement(signal: Signal, levels: int) -> bool:
+    """Return whether a signal of so many values may be a measurement."""
     role = role_by_name(signal.name)
     if role not in ("measurement", None) or len(signal) < _FEWEST_SAMPLES:
         return False
-    return kind in ("steps", "varies") or (kind == "two-level" and role == "measurement")
+    return levels > 2 or (levels == 2 and role == "measurement")
 
 
-def _may_be_command(signal: Signal, measurement_kind: str, kind: str) -> bool:
+def _may_be_command(signal: Signal, measurement_levels: int, levels: int) -> bool:
+    """Return whether a signal may be the command of a measurement, by how many values each has."""
     role = role_by_name(signal.name)
     if role not in ("command", None):
         return False
     # A controller's command varies as its measurement does, and then what steps is a set-point.
-    varies = kind == "varies" and (role == "command" or measurement_kind == "varies")
-    return varies or kind in ("two-level", "steps")
+    steps = 2 <= levels <= _MOST_LEVELS
+    varies = levels > _MOST_LEVELS and (role == "command" or measurement_levels > _MOST_LEVELS)
+    return steps or varies
 
 
 def _overlap(measurement: Signal, command: Signal) -> bool:
