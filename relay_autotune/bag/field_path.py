@@ -23,6 +23,7 @@ import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from struct import calcsize
 from typing import Any
 
@@ -39,6 +40,7 @@ class Number:
 
     name: str
     form: str
+    has_numbers = True
 
     @property
     def size(self) -> int:
@@ -51,6 +53,7 @@ class Text:
     """A string; ``wide`` ones are written in different ways by different middlewares."""
 
     wide: bool = False
+    has_numbers = False
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,11 @@ class Struct:
     name: str
     fields: Fields = ()
 
+    @cached_property
+    def has_numbers(self) -> bool:
+        """Whether it holds a number; cached, since types that double are looked through once."""
+        return any(kind.has_numbers for _, kind in self.fields)
+
 
 @dataclass(frozen=True)
 class Repeated:
@@ -75,6 +83,11 @@ class Repeated:
 
     item: Type
     count: int | None
+
+    @property
+    def has_numbers(self) -> bool:
+        """Whether its elements hold a number."""
+        return self.item.has_numbers
 
 
 Type = Number | Text | Struct | Repeated
@@ -92,39 +105,23 @@ _FORMS = {
 NUMBERS = {name: Number(name, form) for name, form in _FORMS.items()}
 
 
-def numeric_paths(root: Type, without: tuple[str, ...] = ()) -> Iterator[str]:
+def numeric_paths(kind: Type, prefix: str = "", without: tuple[str, ...] = ()) -> Iterator[str]:
     """Yield the paths of a type's numbers; one element stands for those of an array.
 
     A type of a kilobyte can hold more paths than can be listed: take only some.
 
-    :param root: the type.
+    :param kind: the type.
+    :param prefix: the path of what is of this type.
     :param without: names of its own fields that are left out.
     """
-    if isinstance(root, Struct) and without:
-        root = Struct(root.name, tuple(f for f in root.fields if f[0] not in without))
-    return _paths(root, "", {})
-
-
-def _paths(kind: Type, prefix: str, known: dict[int, bool]) -> Iterator[str]:
     if isinstance(kind, Number):
         yield prefix
     elif isinstance(kind, Repeated):
-        yield from _paths(kind.item, f"{prefix}[0]", known)
+        yield from numeric_paths(kind.item, f"{prefix}[0]")
     elif isinstance(kind, Struct):
         for name, inner in kind.fields:
-            # Where there are none, looking once is enough.
-            if _has_numbers(inner, known):
-                yield from _paths(inner, f"{prefix}.{name}" if prefix else name, known)
-
-
-def _has_numbers(kind: Type, known: dict[int, bool]) -> bool:
-    if isinstance(kind, Repeated):
-        return _has_numbers(kind.item, known)
-    if not isinstance(kind, Struct):
-        return isinstance(kind, Number)
-    if id(kind) not in known:
-        known[id(kind)] = any(_has_numbers(inner, known) for _, inner in kind.fields)
-    return known[id(kind)]
+            if name not in without and inner.has_numbers:
+                yield from numeric_paths(inner, f"{prefix}.{name}" if prefix else name)
 
 
 # Lists of texts that name the elements of the arrays beside them, and of those in structures
