@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import array
 import contextlib
+import itertools
 import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -282,12 +283,9 @@ def unbroken(messages: Iterable[Any]) -> list[Any]:
     :param messages: of cycles, in any order.
     """
     by_index = {int(message.index): message for message in messages}
-    run: list[Any] = []
-    index = max(by_index, default=-1)
-    while index in by_index:
-        run.insert(0, by_index[index])
-        index -= 1
-    return run
+    newest_first = itertools.count(max(by_index, default=-1), -1)
+    run = [by_index[k] for k in itertools.takewhile(by_index.__contains__, newest_first)]
+    return run[::-1]
 
 
 def _check_cycle(message: Any) -> None:
