@@ -47,6 +47,7 @@ from relay_autotune.bag.mcap_layout import (
     segment_content,
 )
 from relay_autotune.bag.mcap_records import (
+    NOWHERE,
     RECORD,
     Content,
     Messages,
@@ -175,8 +176,6 @@ def _together(messages: Messages, kept: list[int], parts: list[bytes]) -> Messag
 # Size up to which segments are joined [bytes]: an array operation on few messages takes as long
 # as one on a thousand.
 _BATCH = 256 << 10
-
-_NOWHERE: IntArray = np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -353,9 +352,9 @@ class McapFile(BagFile):
             return
         for channel in wanted & (found.messages.keys() | piece.listed.keys()):
             own = found.messages.get(channel)
-            there = _NOWHERE if own is None else own.order
+            there = NOWHERE if own is None else own.order
             there = there[np.searchsorted(there, begin) : np.searchsorted(there, stop)]
-            listed = piece.listed.get(channel, _NOWHERE) + begin
+            listed = piece.listed.get(channel, NOWHERE) + begin
             if np.array_equal(there, listed) or np.array_equal(there, np.sort(listed)):
                 continue
             self._note(

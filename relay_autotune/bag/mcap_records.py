@@ -188,7 +188,7 @@ _RUN = 4
 _LONGEST_RUN = 1 << 16
 # Number of channels up to which each one's messages are looked for among all.
 _FEW = 16
-_NOWHERE: IntArray = np.empty(0, dtype=np.int64)
+NOWHERE: IntArray = np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -210,9 +210,6 @@ class Messages:
     publish_time: IntArray
     begin: IntArray
     end: IntArray
-
-    def __len__(self) -> int:
-        return int(self.begin.size)
 
     def payloads(self) -> Iterator[bytes]:
         """Yield a copy of each of them, serialized."""
@@ -463,7 +460,7 @@ def listed_records(
         if channel in wanted:
             found[channel] = _messages_at(content, at, heads, end + RECORD.size)
     # They begin at different places, and together they have all of its bytes.
-    return Sorted(found, _NOWHERE, _NOWHERE, 0) if covered == len(content) > 0 else None
+    return Sorted(found, NOWHERE, NOWHERE, 0) if covered == len(content) > 0 else None
 
 
 def _chosen(values: NDArray[Any], chosen: NDArray[np.bool_]) -> NDArray[Any]:
