@@ -299,9 +299,7 @@ class _Cursor:
                     "a field of type wstring lies before the one that is wanted; "
                     "its length differs between middlewares, so that it cannot be passed"
                 )
-            # In two steps: reading the length moves the place.
-            length = self._length()
-            self._advance(length)
+            self._advance(self._length())
         elif isinstance(kind, Struct):
             for _, inner in kind.fields:
                 self._skip(inner)
@@ -311,15 +309,13 @@ class _Cursor:
     def _skip_items(self, item: Type, count: Place) -> None:
         """Pass a number of elements of an array or sequence."""
         if isinstance(item, Number):
-            if isinstance(count, int):
-                if count:
-                    self._align(item.size)
-                    self._advance(count * item.size)
-                return
             # Where a sequence is empty nothing is aligned.
             before = self._place
             self._align(item.size)
-            self._place = np.where(count > 0, self._place, before)
+            if not isinstance(count, int):
+                self._place = np.where(count > 0, self._place, before)
+            elif not count:
+                self._place = before
             self._advance(count * item.size)
             return
         for _ in self._each(count):
