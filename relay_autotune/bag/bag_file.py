@@ -223,10 +223,7 @@ class McapFile(BagFile):
         index = self._layout.index
         if index is None:
             return self._layout.holding(wanted)
-        counts = self._layout.declared.message_counts
-        # An index that leads to fewer messages than there are, or to more, chooses no chunk.
-        trusted = counts is not None and index.lists(wanted, counts)
-        chosen = index.holding(wanted if trusted else None)
+        chosen = index.holding(wanted, self._layout.declared.message_counts)
         self.announce((segment.start, segment.index_end) for segment in chosen)
         # Only the chunks that will be read are checked: on a disk each check takes time.
         if all(record_at(self, s.start, s.end) == (Opcode.CHUNK, s.end) for s in chosen):

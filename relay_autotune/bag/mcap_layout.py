@@ -81,25 +81,21 @@ class ChunkIndex:
     channel: IntArray
     listed: IntArray
 
-    def holding(self, channels: frozenset[int] | None) -> list[Segment]:
+    def holding(self, channels: frozenset[int], counts: dict[int, int] | None) -> list[Segment]:
         """Return the chunks that may hold messages of some channels, in the order of the file.
 
-        :param channels: their ids; None: all chunks.
+        An index that lists fewer of them than there are, or more, chooses no chunk.
+
+        :param channels: their ids.
+        :param counts: number of messages of each channel, by the statistics; None: not known.
         """
-        wanted = np.isin(self.channel, list(channels or ()))
-        chosen = (self.count == 0) | (channels is None)
+        listed = np.bincount(self.channel, self.listed, 1 << 16)
+        trusted = counts is not None and all(listed[c] == counts.get(c, 0) for c in channels)
+        chosen = (self.count == 0) | (not trusted)
+        wanted = np.isin(self.channel, list(channels))
         chosen[np.repeat(np.arange(self.start.size), self.count)[wanted]] = True
         columns = (column[chosen].tolist() for column in (self.start, self.end, self.index_end))
         return list(map(Segment, *columns))
-
-    def lists(self, channels: frozenset[int], counts: dict[int, int]) -> bool:
-        """Return whether it lists as many messages as the statistics of the file.
-
-        :param channels: the ids of those that are wanted.
-        :param counts: number of messages of each channel, by the statistics.
-        """
-        listed = np.bincount(self.channel, self.listed, 1 << 16)
-        return all(listed[channel] == counts.get(channel, 0) for channel in channels)
 
 
 @dataclass
