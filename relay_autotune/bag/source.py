@@ -98,9 +98,12 @@ class Source:
         self._expanded = 0
         self._file = open_regular(path)
         try:
+            self.look_again()
             if self.span(0, len(ZSTD_MAGIC)) == ZSTD_MAGIC:
                 self._expand()
-            self.look_again()
+                self.look_again()
+                # What it holds is counted anew.
+                self._expanded = 0
             self._check_start()
             self._open()
         except BaseException:
@@ -135,20 +138,21 @@ class Source:
             raise BagError(f"cannot read {self.path}: {system_says(error)}") from error
         return data
 
-    def count_expanded(self, size: int) -> None:
+    def count_expanded(self, size: int, of: str = "") -> None:
         """Count what a compressed part has expanded to.
 
         Each part has a limit of its own; a small file of many parts could still keep a reader busy
         for hours.
 
         :param size: of the part [bytes].
+        :param of: what is expanded, for the error; empty: what the file holds.
         :raises BagError: if all parts together expand to more than a recording does.
         """
         self._expanded += size
         most = max(UNSUSPICIOUS, MOST_EXPANSION * self.size)
         if self._expanded > most:
             raise BagError(
-                f"what {self.path} holds expands to more than {most} bytes, over "
+                f"{of or f'what {self.path} holds'} expands to more than {most} bytes, over "
                 f"{MOST_EXPANSION} times its size; expected a recording"
             )
 
@@ -200,31 +204,24 @@ class Source:
 
     def _expand(self) -> None:
         """Expand a file that is compressed as a whole into a temporary file."""
-        most = max(UNSUSPICIOUS, MOST_EXPANSION * os.fstat(self._file.fileno()).st_size)
         try:
             with self._file as compressed:
                 # close() closes it, which deletes it.
                 self._file = tempfile.TemporaryFile(prefix="relay_autotune_")  # noqa: SIM115
                 room = shutil.disk_usage(tempfile.gettempdir()).free - FREE_DISK
-                written = 0
                 with expanding() as zstandard:
                     decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_WINDOW)
                     stream = decompressor.stream_reader(compressed)
                     while piece := stream.read(1 << 20):
-                        written += len(piece)
-                        if written > most:
-                            raise BagError(
-                                f"{self.path} expands to more than {most} bytes, over "
-                                f"{MOST_EXPANSION} times its size; expected a recording"
-                            )
-                        if written > room:
+                        self.count_expanded(len(piece), str(self.path))
+                        if self._expanded > room:
                             raise BagError(
                                 f"{self.path} expands to more than the {max(room, 0)} bytes that "
                                 f"are free in {tempfile.gettempdir()}; set TMPDIR to a larger disk"
                             )
                         self._file.write(piece)
                         self._file.flush()
-            if not written:
+            if not self._expanded:
                 self.notes.append(f"{self.path.name} ends before anything can be expanded")
         except DamageError as damage:
             # What came before is a recording that ends there.
