@@ -284,10 +284,11 @@ def _element(
             f"{of} has no {path!r}: an array of {array.count} elements ends at [{array.count - 1}]"
         )
     names = _names_of(array, key, around)
+    only = names[0] if len(names) == 1 else None
     if by_place:
-        return Element(int(name), names if isinstance(names, Names) else None)
-    if isinstance(names, Names):
-        return Element(name, names)
+        return Element(int(name), only)
+    if only:
+        return Element(name, only)
     if key:
         raise FieldError(
             f"{of} has no names {key!r} for {path!r}: expected a field of texts or whole numbers "
@@ -296,7 +297,7 @@ def _element(
     if names:
         raise FieldError(
             f"{of} has several lists of names, so that {path!r} is not clear; write "
-            f"[{names[0]}={name}] or [{names[1]}={name}]"
+            f"[{names[0].field}={name}] or [{names[1].field}={name}]"
         )
     raise FieldError(
         f"{of} has no list of names for {path!r}, such as {', '.join(NAME_LISTS[:4])}; expected "
@@ -304,10 +305,8 @@ def _element(
     )
 
 
-def _names_of(
-    array: Repeated, key: str, around: Sequence[tuple[int, Struct]]
-) -> Names | list[str] | None:
-    """Return what names the elements of an array; several lists: their names; None: nothing.
+def _names_of(array: Repeated, key: str, around: Sequence[tuple[int, Struct]]) -> list[Names]:
+    """Return what may name the elements of an array.
 
     :param array: the array.
     :param key: the field or the list that is meant; empty: the usual ones.
@@ -318,13 +317,13 @@ def _names_of(
         kind = dict(array.item.fields).get(own)
         whole = bool(key) and isinstance(kind, Number) and kind.form not in "fd"
         if whole or (isinstance(kind, Text) and not kind.wide):
-            return Names(own, None)
+            return [Names(own, None)]
     for depth, struct in reversed(around):
         fields = dict(struct.fields)
-        found = [name for name in lists if _is_list(fields.get(name))]
+        found = [Names(name, depth) for name in lists if _is_list(fields.get(name))]
         if found:
-            return Names(found[0], depth) if len(found) == 1 else found
-    return None
+            return found
+    return []
 
 
 def _is_list(kind: Type | None) -> bool:
