@@ -28,7 +28,6 @@ from relay_autotune.errors import ParameterError
 from relay_autotune.experiment.faults import (
     FrozenWatch,
     SafePolicy,
-    SampleCheck,
     SilenceWatch,
     proportional_hold,
 )
@@ -37,10 +36,9 @@ from relay_autotune.experiment.phases import (
     Ended,
     Facts,
     Kick,
-    Left,
     Probe,
+    Run,
     Settle,
-    Setup,
     State,
     failed,
 )
@@ -60,7 +58,7 @@ counted [s], inf: max_duration alone limits it; ``where`` is the state as the en
 says what it waits for and sees, after the same sample.
 """
 
-_PHASES: Mapping[State, Callable[[Setup, Facts], Phase]] = {
+_PHASES: Mapping[State, Callable[[Run], Phase]] = {
     State.KICK: Kick,
     State.PROBE: Probe,
     State.RELAY: Switching,
@@ -121,45 +119,42 @@ class RelayExperiment:
         self.state = State.SETTLING
         """The present state."""
         self._levels = Levels(parameters, self.baseline, from_small=from_small)
-        self._setup = Setup(parameters, self.baseline, until_converged, self._levels)
-        self._trace = self._setup.trace
-        self._phase: Phase = Settle(self._setup, before)
-        self._relay: Switching | None = None
-        self._facts = Facts(sign=parameters.process_gain_sign)
+        self._run = Run(parameters, self.baseline, until_converged, self._levels)
+        self._run.facts.sign = parameters.process_gain_sign
+        self._trace = self._run.trace
+        self._phase: Phase = Settle(self._run, before)
         self._why = NONE
         self._policy = policy
         self._hold: Callable[[float], float] | None = None
         self._frozen = FrozenWatch()
         self._silence = SilenceWatch()
-        self._check = SampleCheck()
-        self._origin = math.nan
 
     # What is known of it.
 
     @property
     def facts(self) -> Facts:
         """What has been found so far."""
-        return self._facts if self._relay is None else self._relay.facts
+        return self._run.facts
 
     @property
     def cycles(self) -> tuple[Cycle, ...]:
         """The whole cycles so far."""
-        return () if self._relay is None else self._relay.cycles
+        return self._run.cycles
 
     @property
     def cycle_start(self) -> tuple[int, ...]:
         """Index of the first sample of each cycle, as in a record."""
-        return () if self._relay is None else self._relay.cycle_start
+        return self._run.cycle_start
 
     @property
     def switches(self) -> int:
         """Number of switches of the relay so far; two of them are a half cycle."""
-        return 0 if self._relay is None else self._relay.switches
+        return self._run.switches
 
     @property
     def is_tried(self) -> bool:
         """True unless it is not known yet whether the actuator follows the levels."""
-        return not self._levels.from_small if self._relay is None else self._relay.is_tried
+        return self._run.is_tried
 
     @property
     def latest(self) -> float:
@@ -215,7 +210,7 @@ class RelayExperiment:
         """Why it ended, with notes; its code is NONE before."""
         if not self._why:
             return NONE
-        notes, silent = [*self._setup.notes], self._silence.silence
+        notes, silent = [*self._run.notes], self._silence.silence
         if repeated := self._silence.repeated:
             at_end = self.outcome is not Outcome.COMPLETED and silent > 0.0
             notes.append(
@@ -235,7 +230,7 @@ class RelayExperiment:
             return f"{self.outcome.name.lower()}: {self.reason}"
         if not self._trace:
             return "waiting for the first measurement"
-        return self._phase.status(*self._setup.now)
+        return self._phase.status(*self._run.now)
 
     @property
     def sample_count(self) -> int:
@@ -338,22 +333,15 @@ class RelayExperiment:
         trace = self._trace
         if self.finished:
             return self.after_end(measurement)
-        last = trace.time[-1] if trace else -math.inf
-        problem = self._check.problem(len(trace), time, measurement, last, self._origin)
-        if problem is not None:
+        if (problem := trace.take(time, measurement)) is not None:
             return self._end(failed(problem), math.nan)
-        if not trace:
-            self._origin = float(time)
-        t, y = float(time) - self._origin, float(measurement)
-        trace.add(t, y)
+        t, y = trace.time[-1], trace.measurement[-1]
         end = self._passes_limit(t, y) or self._is_dead(t, y, repeated=repeated)
         found = end or self._phase.answer(trace.seen[-1], y)
-        if isinstance(found, Left):
-            self._facts = found.facts
-            self.state = found.then
-            self._phase = phase = _PHASES[found.then](self._setup, found.facts)
-            self._relay = phase if isinstance(phase, Switching) else None
-            found = phase.command
+        if isinstance(found, State):
+            self.state = found
+            self._phase = _PHASES[found](self._run)
+            found = self._phase.command
         if isinstance(found, Ended):
             command = self._end(found, y)
         elif self.parameters.command_rate > 0.0:
@@ -397,7 +385,7 @@ class RelayExperiment:
         :returns: the command of :meth:`after_end` [u], to be sent now.
         """
         if not self.finished:
-            at = self.elapsed if time is None or not self._trace else time - self._origin
+            at = self.elapsed if time is None or not self._trace else time - self._trace.origin
             why = _reason(reason).plus(ended_at=at, where=self._phase.where)
             self._end(Ended(State.ABORTED, why), math.nan)
         return self.after_end(self._last_measurement())

@@ -124,47 +124,6 @@ class ClockWatch:
         return Code.CLOCK_STEPPED(before=self._reference, now=difference)
 
 
-# Numbers beyond this are no measurements, and their squares may overflow.
-_LARGEST = 1e100
-# More samples than this with the same time mean that the clock stands still.
-_LONGEST_REPEAT = 10_000
-
-
-class SampleCheck:
-    """Recognise numbers that are no measurements, and times that do not advance."""
-
-    def __init__(self) -> None:
-        self._repeats = 0
-
-    def problem(
-        self, count: int, time: float, measurement: float, last: float, origin: float
-    ) -> Reason | None:
-        """Take a sample; return why it cannot be used, None if it can.
-
-        :param count: number of samples before.
-        :param time: its instant [s].
-        :param measurement: [y].
-        :param last: instant of the previous sample, from the first one [s]; -inf: there is none.
-        :param origin: instant of the first sample [s].
-        """
-        if not -_LARGEST < measurement < _LARGEST:
-            return Code.BAD_MEASUREMENT(samples=count, value=measurement)
-        if not -_LARGEST < time < _LARGEST:
-            return Code.BAD_TIME(samples=count, time=time)
-        if last == -math.inf:
-            return None
-        t = float(time) - origin
-        if t > last:
-            self._repeats = 0
-            return None
-        if t < last:
-            return Code.TIME_BACKWARDS(before=last, time=t)
-        self._repeats += 1
-        if self._repeats < _LONGEST_REPEAT:
-            return None
-        return Code.TIME_REPEATS(samples=_LONGEST_REPEAT, time=t)
-
-
 # A silence is too long if it exceeds a multiple of the longest one while the relay switched, a
 # number of repetitions, and a whole period.
 _SILENT_RATIO = 3.0

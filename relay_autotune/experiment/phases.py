@@ -3,8 +3,9 @@
 
 """What the states of a relay experiment share, and those before the relay: settle, kick, probe.
 
-A state takes samples. It returns a command for each, or the event that ends it with what it has
-found. :mod:`relay_autotune.experiment.experiment` has the table of what follows.
+A state takes samples. It returns a command for each, or the state after it, and keeps what it
+has found in the :class:`Run`. :mod:`relay_autotune.experiment.experiment` has the table of what
+follows.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import enum
 import math
 from array import array
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -34,6 +35,7 @@ from relay_autotune.experiment.settling import (
     rest_state,
 )
 from relay_autotune.reasons import Code, Reason
+from relay_autotune.record.record import Cycle
 from relay_autotune.text import duration
 
 # An interval counts at most this many times the mean of the intervals before it: a gap in the
@@ -42,12 +44,18 @@ from relay_autotune.text import duration
 GAP = 300.0
 # For this many first intervals, the mean is that of the shorter half: one of them may be a gap.
 _FIRST = 20
+# Numbers beyond this are no measurements, and their squares may overflow.
+_LARGEST = 1e100
+# More samples than this with the same time mean that the clock stands still.
+_LONGEST_REPEAT = 10_000
 
 
 class Samples:
     """Columns that grow by one sample at a time at little cost, and return any part as arrays."""
 
     def __init__(self) -> None:
+        self.origin = math.nan
+        """Instant of the first sample, on the caller's axis [s]; NaN before it."""
         self.time = array("d")
         """Instants [s from the first sample]."""
         self.seen = array("d")
@@ -57,14 +65,33 @@ class Samples:
         self.command = array("d")
         """Commands [u]; one fewer while a sample is being answered."""
         self._gaps = 0.0
-        self._steps = 0
+        self._steps = self._repeats = 0
 
-    def add(self, time: float, measurement: float) -> None:
-        """Append a sample that is not answered yet.
+    def take(self, time: float, measurement: float) -> Reason | None:
+        """Append a sample that is not answered yet, or return why it cannot be used.
 
-        :param time: its instant [s from the first sample], not before the last one.
+        :param time: its instant [s], on any axis.
         :param measurement: [y].
         """
+        if not -_LARGEST < measurement < _LARGEST:
+            return Code.BAD_MEASUREMENT(samples=len(self), value=measurement)
+        if not -_LARGEST < time < _LARGEST:
+            return Code.BAD_TIME(samples=len(self), time=time)
+        if not self.time:
+            self.origin = float(time)
+        t = float(time) - self.origin
+        if self.time and t <= self.time[-1]:
+            if t < self.time[-1]:
+                return Code.TIME_BACKWARDS(before=self.time[-1], time=t)
+            self._repeats += 1
+            if self._repeats >= _LONGEST_REPEAT:
+                return Code.TIME_REPEATS(samples=_LONGEST_REPEAT, time=t)
+        else:
+            self._repeats = 0
+        self._add(t, float(measurement))
+        return None
+
+    def _add(self, time: float, measurement: float) -> None:
         # Several samples at one instant (a clock in steps) count as one interval.
         if self.time and time > self.time[-1]:
             if self._steps < _FIRST:
@@ -116,7 +143,7 @@ class State(enum.IntEnum):
     FAILED = 7
 
 
-@dataclass(frozen=True)
+@dataclass
 class Facts:
     """What the states have found, each for those after it."""
 
@@ -138,9 +165,9 @@ class Facts:
     """Time from the kick to the first sample of the response [s]; NaN until it is seen."""
 
 
-@dataclass(frozen=True)
-class Setup:
-    """What every state of an experiment has.
+@dataclass
+class Run:
+    """What the states of an experiment share: what it was given, and what they have found.
 
     :param parameters: the user's parameters, valid.
     :param baseline: command of the operating point [u].
@@ -154,8 +181,15 @@ class Setup:
     """The levels of the relay."""
     trace: Samples = field(default_factory=Samples)
     """The samples so far; each is appended before it is answered."""
+    facts: Facts = field(default_factory=Facts)
     notes: list[Reason] = field(default_factory=list)
     """What else is to be known of the experiment, in the order in which it was found."""
+    cycles: tuple[Cycle, ...] = ()
+    """The whole cycles of the relay so far."""
+    cycle_start: tuple[int, ...] = ()
+    """Index of the first sample of each cycle, as in a record."""
+    switches: int = 0
+    """Number of switches of the relay so far; two of them are a half cycle."""
 
     @property
     def now(self) -> tuple[float, float]:
@@ -166,17 +200,13 @@ class Setup:
         """Return a level of the relay [u]."""
         return self.levels.high if is_high else self.levels.low
 
+    @property
+    def is_tried(self) -> bool:
+        """True unless the levels began small and it is not known yet whether the process follows.
 
-@dataclass(frozen=True)
-class Left:
-    """A state has ended.
-
-    :param then: the state after it.
-    :param facts: what is known now.
-    """
-
-    then: State
-    facts: Facts
+        Until then the cycles may be those of an actuator that is at its ends.
+        """
+        return not self.levels.from_small or len(self.cycles) >= TRIED
 
 
 @dataclass(frozen=True)
@@ -191,8 +221,8 @@ class Ended:
     why: Reason
 
 
-Answer = float | Left | Ended
-"""What a state makes of a sample: a command [u], or its end."""
+Answer = float | State | Ended
+"""What a state makes of a sample: a command [u], the state after it, or the end."""
 
 
 def failed(why: Reason) -> Ended:
@@ -225,48 +255,50 @@ _SMALL_STAYS = 10.0
 
 # Cycles that a tune usually takes beyond those that must agree.
 _USUAL_EXTRA = 2
+# If the levels started at a quarter, the swings are compared after this many cycles.
+TRIED = 2
 SMALL_CYCLES = 2
 """Oscillations that a given amplitude takes longer where it begins small: one, and the way on."""
 
 
-def _settling_limit(setup: Setup) -> float:
-    return max(SETTLING_LIMIT, SETTLING_SAMPLES * setup.trace.interval)
+def _settling_limit(run: Run) -> float:
+    return max(SETTLING_LIMIT, SETTLING_SAMPLES * run.trace.interval)
 
 
-def kick_limit(setup: Setup, facts: Facts) -> float:
+def kick_limit(run: Run) -> float:
     """Return the longest wait for a response, and then for the first switch [s]."""
-    if setup.parameters.max_duration > 0.0:
+    if run.parameters.max_duration > 0.0:
         return math.inf
-    return max(KICK_LIMIT, KICK_SETTLINGS * facts.settled_at)
+    return max(KICK_LIMIT, KICK_SETTLINGS * run.facts.settled_at)
 
 
 class Settle:
     """Hold the baseline until the measurement is steady, or settle_time is over.
 
-    :param setup: of the experiment.
+    :param run: of the experiment.
     :param before: measurements before the first command, where the baseline is the present command
         [y]; None: the baseline may lead the process elsewhere.
     """
 
     where = "while settling"
 
-    def __init__(self, setup: Setup, before: Sequence[float] | None) -> None:
-        self._setup = setup
+    def __init__(self, run: Run, before: Sequence[float] | None) -> None:
+        self._run = run
         self._settling = Settling()
         self._watch = None if before is None else RestWatch(before)
-        self.command = setup.baseline
+        self.command = run.baseline
 
     @property
     def latest(self) -> float:
         """Deadline [s]."""
-        if self._setup.parameters.max_duration > 0.0:
+        if self._run.parameters.max_duration > 0.0:
             return math.inf
-        return _BEYOND * (_settling_limit(self._setup) + self._setup.parameters.settle_time)
+        return _BEYOND * (_settling_limit(self._run) + self._run.parameters.settle_time)
 
     def answer(self, t: float, y: float) -> Answer:
         """Take the last sample."""
-        setup, p, n = self._setup, self._setup.parameters, len(self._setup.trace)
-        baseline = setup.baseline
+        run, p, n = self._run, self._run.parameters, len(self._run.trace)
+        baseline = run.baseline
         if self._watch is not None and self._watch.leaves(y):
             rest = self._watch.rested_at
             return failed(Code.NOT_AT_BASELINE(rest=rest, value=y, time=t, baseline=baseline))
@@ -274,13 +306,13 @@ class Settle:
             if t < p.settle_time or n < _LEAST_SETTLING_SAMPLES:
                 return baseline
             # Whatever the rest, since the user chose that time.
-            rest_then = rest_state(*setup.trace.columns(0, n)[:2], n)
+            rest_then = rest_state(*run.trace.columns(0, n)[:2], n)
             if not rest_then.is_steady:
-                setup.notes.append(Code.NOTE_NOT_STEADY(motion=str(rest_then)))
+                run.notes.append(Code.NOTE_NOT_STEADY(motion=str(rest_then)))
             return self._settled(rest_then)
         if not self._settling.is_due(n):
             return baseline
-        found, settled = self._settling.look(*setup.trace.columns(0, n)[:2])
+        found, settled = self._settling.look(*run.trace.columns(0, n)[:2])
         # A constant measurement may not have responded to a wrong baseline yet.
         if settled and (self._watch is None or n >= NOISE_SAMPLES):
             return self._settled(found)
@@ -288,15 +320,12 @@ class Settle:
             return failed(Code.NOT_STEADY(time=t, motion=str(found)))
         return baseline
 
-    def _settled(self, rest: RestState) -> Left:
-        p, trace, watch = self._setup.parameters, self._setup.trace, self._watch
+    def _settled(self, rest: RestState) -> State:
+        run, p, trace, watch = self._run, self._run.parameters, self._run.trace, self._watch
         if watch is not None and watch.has_moved_to(rest.mean):
-            self._setup.notes.append(
-                Code.NOTE_MOVED(
-                    rest=watch.rested_at, value=rest.mean, baseline=self._setup.baseline
-                )
-            )
-        facts = Facts(
+            moved = {"rest": watch.rested_at, "value": rest.mean}
+            run.notes.append(Code.NOTE_MOVED(**moved, baseline=run.baseline))
+        run.facts = Facts(
             rest=rest,
             settled_at=trace.seen[-1],
             kicked_at=trace.time[-1],
@@ -304,11 +333,11 @@ class Settle:
             hysteresis=p.band(rest.noise_std),
             sign=p.process_gain_sign,
         )
-        return Left(State.KICK, facts)
+        return State.KICK
 
     def status(self, t: float, _: float) -> str:
         """Say what it waits for and sees."""
-        p, interval, rest = self._setup.parameters, self._setup.trace.interval, self._settling.rest
+        p, interval, rest = self._run.parameters, self._run.trace.interval, self._settling.rest
         if p.settle_time > 0.0:
             return f"settling, {duration(t)} of {duration(p.settle_time)}"
         end = self._settling.expected_end(interval)
@@ -320,71 +349,67 @@ class Settle:
         now += f": still {rest.motion}"
         if about:
             return now
-        limit = p.max_duration or _settling_limit(self._setup)
+        limit = p.max_duration or _settling_limit(self._run)
         return f"{now}, not slower than before; it may take {duration(limit)} in all"
 
 
 class Kick:
     """Hold one level of the relay until the measurement leaves its rest.
 
-    :param setup: of the experiment.
-    :param facts: with the rest.
+    :param run: of the experiment, with the rest.
     """
 
-    def __init__(self, setup: Setup, facts: Facts) -> None:
-        self._setup, self._facts = setup, facts
-        self._begun, y = setup.now
+    def __init__(self, run: Run) -> None:
+        self._run, facts = run, run.facts
+        self._begun, y = run.now
         # With a given sign, kick towards the set-point, unless the measurement is already there.
         self._is_high = (
             facts.sign == 0
             or Relay(facts.sign, facts.setpoint, facts.hysteresis, self._begun, y).is_high
         )
         self._detector = ResponseDetector(facts.rest, self._begun)
-        self._limit = kick_limit(setup, facts)
+        self._limit = kick_limit(run)
         self.latest = facts.settled_at + _BEYOND * self._limit
         """Deadline [s]."""
-        stays = _SMALL_STAYS if setup.levels.from_small else 1.0
+        stays = _SMALL_STAYS if run.levels.from_small else 1.0
         self._grow_after = stays * max(
-            _GROWTH_SETTLINGS * facts.settled_at, _GROWTH_SAMPLES * setup.trace.interval
+            _GROWTH_SETTLINGS * facts.settled_at, _GROWTH_SAMPLES * run.trace.interval
         )
         self.where = f"while waiting for the measurement to leave its rest {facts.rest.mean:g}"
 
     @property
     def command(self) -> float:
         """The level [u]."""
-        return self._setup.level(is_high=self._is_high)
+        return self._run.level(is_high=self._is_high)
 
     def answer(self, t: float, y: float) -> Answer:
         """Take the last sample."""
-        levels, detector, since = self._setup.levels, self._detector, t - self._begun
+        levels, facts, detector = self._run.levels, self._run.facts, self._detector
+        since = t - self._begun
         if detector.add(t, y):
             if levels.from_small:
                 levels.begin_small()
             elif levels.can_grow:
                 # A response that only just exceeds the noise says too little.
                 levels.grow()
-            facts = replace(
-                self._facts,
-                side=detector.side,
-                response_time=detector.first_outside - self._begun,
-            )
-            return Left(State.RELAY if facts.sign else State.PROBE, facts)
+            facts.side = detector.side
+            facts.response_time = detector.first_outside - self._begun
+            return State.RELAY if facts.sign else State.PROBE
         if levels.can_grow and since >= self._grow_after:
             levels.grow()
             self._grow_after *= 2.0
-        if t - self._facts.settled_at <= self._limit:
+        if t - facts.settled_at <= self._limit:
             return self.command
-        rest, band = self._facts.rest.mean, detector.band
+        rest, band = facts.rest.mean, detector.band
         stayed = {"band": band, "rest": rest} if band else {"still": rest}
         return failed(
-            Code.NO_RESPONSE(
-                level=self.command, baseline=self._setup.baseline, time=since, **stayed
-            )
+            Code.NO_RESPONSE(level=self.command, baseline=self._run.baseline, time=since, **stayed)
         )
 
     def status(self, t: float, y: float) -> str:
         """Say what it waits for and sees."""
-        rest, limit = self._facts.rest.mean, self._facts.settled_at + self._limit - self._begun
+        facts = self._run.facts
+        rest, limit = facts.rest.mean, facts.settled_at + self._limit - self._begun
         wait = f", for {duration(limit)} at most" if math.isfinite(limit) else ""
         return (
             f"stepped to {self.command:g} u, no response after {duration(t - self._begun)}: the "
@@ -395,41 +420,42 @@ class Kick:
 class Probe:
     """Hold the high level for a moment, then the baseline, until the sign of the gain is clear.
 
-    :param setup: of the experiment.
-    :param facts: with the response.
+    :param run: of the experiment, with the response.
     """
 
     where = "while finding the sign of the process gain"
 
-    def __init__(self, setup: Setup, facts: Facts) -> None:
-        self._setup, self._facts = setup, facts
-        t, y = setup.now
-        interval = max(facts.response_time, _PROBE_SAMPLES * setup.trace.interval)
+    def __init__(self, run: Run) -> None:
+        self._run, facts = run, run.facts
+        t, y = run.now
+        interval = max(facts.response_time, _PROBE_SAMPLES * run.trace.interval)
         self._watch = DirectionWatch(interval, t, facts.rest, facts.side)
         self._watch.add(t, y)
         self._pulse_end = t + interval
-        looks = max(LAST_LOOK * interval, LAST_LOOK_SAMPLES * setup.trace.interval)
+        looks = max(LAST_LOOK * interval, LAST_LOOK_SAMPLES * run.trace.interval)
         self.latest = t + _BEYOND * looks
         """Deadline [s]."""
-        self.command = setup.levels.high
+        self.command = run.levels.high
 
     def answer(self, t: float, y: float) -> Answer:
         """Take the last sample."""
-        levels, sign = self._setup.levels, self._watch.add(t, y)
+        run, levels, sign = self._run, self._run.levels, self._watch.add(t, y)
         if sign == 0:
-            return levels.high if t < self._pulse_end else self._setup.baseline
-        if self._watch.remains < self._facts.rest.noise_std:
+            return levels.high if t < self._pulse_end else run.baseline
+        if self._watch.remains < run.facts.rest.noise_std:
             # The pulse left no deviation: noise had looked like a response.
             if levels.from_small:
                 levels.begin_larger()
-            return Left(State.KICK, self._facts)
-        return Left(State.RELAY, replace(self._facts, sign=sign))
+            return State.KICK
+        run.facts.sign = sign
+        return State.RELAY
 
     def status(self, t: float, y: float) -> str:
         """Say what it waits for and sees."""
+        run, facts = self._run, self._run.facts
         return (
-            f"the measurement went {'up' if self._facts.side > 0 else 'down'} after "
-            f"{duration(self._facts.response_time)}; at {self._setup.trace.command[-1]:g} u it is "
+            f"the measurement went {'up' if facts.side > 0 else 'down'} after "
+            f"{duration(facts.response_time)}; at {run.trace.command[-1]:g} u it is "
             f"{y:.6g} y, and shows whether it stays on that side, for "
             f"{duration(max(self.latest - t, 0.0))} at most"
         )

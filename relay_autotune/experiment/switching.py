@@ -23,7 +23,7 @@ from relay_autotune.experiment.faults import (
     why_no_return,
     why_noise_alone,
 )
-from relay_autotune.experiment.phases import Answer, Ended, Facts, Setup, State, failed, kick_limit
+from relay_autotune.experiment.phases import Answer, Ended, Run, State, failed, kick_limit
 from relay_autotune.experiment.relay_law import (
     MOST_COMPENSATED,
     DwellFilter,
@@ -74,9 +74,9 @@ _MANY_STAYS, _OF_RESPONSE = 40, 0.5
 # Three stays as long as that show that the time to respond was not that of a gap.
 _LONG_STAYS = 3
 
-# If the levels started at a quarter, the swings are compared after this many cycles, once the
-# swing grows by less than this factor from one cycle to the next.
-_TRIED, _STILL = 2, 1.1
+# If the levels started at a quarter, the swings are compared once the swing grows by less than
+# this factor from one cycle to the next.
+_STILL = 1.1
 # A last swing this many times as large as a clear one should have been clear at a quarter, too.
 _CLEARLY = 5.0
 
@@ -149,13 +149,11 @@ class _FastWatch:
 class _Course:
     """The switching since the relay began, with one amplitude that counts, and one sign.
 
-    :param setup: of the experiment.
-    :param facts: with the band, the sign and the response.
-    :param switches: of the relay before.
+    :param run: of the experiment, with the band, the sign and the response.
     """
 
-    def __init__(self, setup: Setup, facts: Facts, switches: int) -> None:
-        t, y = setup.now
+    def __init__(self, run: Run) -> None:
+        (t, y), facts = run.now, run.facts
         self.relay = Relay(facts.sign, facts.setpoint, facts.hysteresis, t, y)
         self.is_high = self.relay.is_high
         """The level in force, later than the relay by the added delay."""
@@ -165,14 +163,14 @@ class _Course:
         """Samples at which it switched last."""
         self.look_after = _RESTS_AFTER * facts.response_time
         """Length of the present stay at which it is looked whether the measurement rests [s]."""
-        self.switches_before = switches
+        self.switches_before = run.switches
         self.began = t
-        self.fast = _FastWatch(switches)
+        self.fast = _FastWatch(run.switches)
         floor = max(facts.hysteresis, abs(y - facts.setpoint), 3.0 * facts.rest.noise_std)
         self.runaway = RunawayWatch(floor)
         self.longest = 0.0
         """The longest stay, or the time to respond if that is longer [s]."""
-        self.ratio = _LONGER / setup.levels.balance
+        self.ratio = _LONGER / run.levels.balance
         """How many times as long the next stay may be."""
         self.stays = DwellFilter(t, facts.response_time)
         self.answers = False
@@ -190,22 +188,16 @@ class Switching:
     cycles count from then on. A load changes the mean command that the process needs, and with it
     the half periods; the levels are shifted so that the half periods stay the same.
 
-    :param setup: of the experiment; the relay begins at its last sample.
-    :param facts: with the band, the sign and the response.
+    :param run: of the experiment, with the band, the sign and the response; the relay begins at
+        its last sample.
     """
 
-    def __init__(self, setup: Setup, facts: Facts) -> None:
-        self._setup, self.facts = setup, facts
-        self.cycles: tuple[Cycle, ...] = ()
-        """The whole cycles so far."""
-        self.cycle_start: tuple[int, ...] = ()
-        """Index of the first sample of each cycle, as in a record."""
-        self.switches = 0
-        """Number of switches of the relay so far; two of them are a half cycle."""
+    def __init__(self, run: Run) -> None:
+        self._run = run
         # A sign that was found may have to be reversed.
-        self._is_doubtful = setup.parameters.process_gain_sign == 0
-        self._kick_amplitude = setup.levels.amplitude
-        self._load = LoadCompensation(setup.levels, setup.notes)
+        self._is_doubtful = run.parameters.process_gain_sign == 0
+        self._kick_amplitude = run.levels.amplitude
+        self._load = LoadCompensation(run.levels, run.notes)
         self._furthest = math.inf
         self._away = 0
         self._begin()
@@ -213,26 +205,18 @@ class Switching:
     @property
     def command(self) -> float:
         """The level in force [u]."""
-        return self._setup.level(is_high=self._course.is_high)
+        return self._run.level(is_high=self._course.is_high)
 
     @property
     def where(self) -> str:
         """The state as the end of a sentence."""
-        n = len(self.cycles)
+        n = len(self._run.cycles)
         return f"after {counted(n, 'whole cycle')}"
-
-    @property
-    def is_tried(self) -> bool:
-        """True unless the levels began small and it is not known yet whether the process follows.
-
-        Until then the cycles may be those of an actuator that is at its ends.
-        """
-        return not self._setup.levels.from_small or len(self.cycles) >= _TRIED
 
     @property
     def latest(self) -> float:
         """Deadline of the switching, unless the limit of a stay grows before [s]."""
-        cycles = self._setup.parameters.max_cycles + _SPARE_CYCLES
+        cycles = self._run.parameters.max_cycles + _SPARE_CYCLES
         return self._course.began + 2.0 * cycles * self._longest_limit
 
     def answer(self, t: float, y: float) -> Answer:
@@ -242,18 +226,18 @@ class Switching:
             if end := self._switched(t):
                 return end
         elif self._rests_in_band(t, y):
-            self._setup.levels.grow()
+            self._run.levels.grow()
             self._begin()
         elif t - max(relay.since, self._load.waits_from) > self._limit:
             if end := self._on_timeout(t, y):
                 return end
         elif self._runs_away(t, y):
-            over = self._is_doubtful and not self.cycles
+            over = self._is_doubtful and not self._run.cycles
             if end := self._on_timeout(t, y) if over else failed(self._why_lost(t, y)):
                 return end
         # The course may have begun anew.
         course = self._course
-        waiting, rounding = course.on_the_way, _ROUNDING * self._setup.trace.interval
+        waiting, rounding = course.on_the_way, _ROUNDING * self._run.trace.interval
         while waiting and waiting[0][0] <= t + rounding:
             _, course.is_high, begins = waiting.popleft()
             if begins and (end := self._begin_cycle()):
@@ -262,9 +246,9 @@ class Switching:
 
     def status(self, t: float, y: float) -> str:
         """Say how the oscillation goes, after the sample that was answered last."""
-        relay, facts, cycles = self._course.relay, self.facts, self.cycles
-        since, needed = t - relay.since, self._setup.parameters.min_cycles
-        if self._setup.levels.searching:
+        relay, facts, cycles = self._course.relay, self._run.facts, self._run.cycles
+        since, needed = t - relay.since, self._run.parameters.min_cycles
+        if self._run.levels.searching:
             now = "the amplitude is still growing"
         elif not cycles:
             now = "no whole cycle yet"
@@ -287,64 +271,64 @@ class Switching:
     # Stays of the relay.
 
     def _begin(self) -> None:
-        self.cycle_start = ()
-        self._course = _Course(self._setup, self.facts, self.switches)
-        p, self._longest_limit = self._setup.parameters, 0.0
-        self._learn(self.facts.response_time)
+        self._run.cycle_start = ()
+        self._course = _Course(self._run)
+        p, self._longest_limit = self._run.parameters, 0.0
+        self._learn(self._run.facts.response_time)
         if not p.max_half_cycle and (p.hysteresis > 0.0 or not math.isnan(p.setpoint)):
             # The user's set-point decides the distance to the first switch, so the time to respond
             # gives no limit.
-            self._limit = kick_limit(self._setup, self.facts)
+            self._limit = kick_limit(self._run)
         self._longest_limit = self._limit
 
     def _learn(self, stay: float) -> None:
         """Set the limit of the next stay from one that has ended [s]."""
-        p, course = self._setup.parameters, self._course
+        p, course = self._run.parameters, self._course
         course.longest = max(course.longest, stay)
-        least = _LEAST_SAMPLES * self._setup.trace.interval
+        least = _LEAST_SAMPLES * self._run.trace.interval
         limit = max(course.ratio * course.longest, least)
-        if self.cycles:
+        if self._run.cycles:
             limit = max(_LIMIT_IN_CYCLES * limit, least)
         self._limit = p.max_half_cycle or limit + 2.0 * p.extra_delay
         self._longest_limit = max(self._longest_limit, self._limit)
 
     def _switched(self, t: float) -> Ended | None:
         """Take a switch of the relay."""
-        course, relay, setup = self._course, self._course.relay, self._setup
-        self.switches += 1
+        course, relay, run = self._course, self._course.relay, self._run
+        run.switches += 1
         # Only a stay without a shift of the levels counts: else each shift would lengthen the
         # limit of the next stay.
         was_shifted, self._load.shifts = self._load.shifts > 0, 0
-        course.look_after = _RESTS_AFTER * self.facts.response_time
+        course.look_after = _RESTS_AFTER * run.facts.response_time
         course.answers = course.stays.add(
             t,
             relay.last_stay,
-            setup.levels.balance,
+            run.levels.balance,
             counts=relay.switches > 1 and not was_shifted,
         )
         self._learn(0.0 if was_shifted else relay.last_stay)
         end: Ended | None = None
         if begins := relay.is_high and course.answers:
             course.stays.begin(t)
-        elif course.stays.is_overdue(t, setup.trace.interval):
+        elif course.stays.is_overdue(t, run.trace.interval):
             end = self._learn_anew()
-        course.on_the_way.append((t + setup.parameters.extra_delay, relay.is_high, begins))
-        course.switched_at.append(len(setup.trace) - 1)
+        course.on_the_way.append((t + run.parameters.extra_delay, relay.is_high, begins))
+        course.switched_at.append(len(run.trace) - 1)
         end = end or self._look_for_noise()
         # The course may have begun anew.
-        course, known = self._course, setup.levels.amplitude <= self._kick_amplitude
-        fast = course.fast.stay(course.relay.last_stay, self.facts.response_time, known=known)
+        course, known = self._course, run.levels.amplitude <= self._kick_amplitude
+        fast = course.fast.stay(course.relay.last_stay, run.facts.response_time, known=known)
         return end or (failed(fast) if fast else None)
 
     def _learn_anew(self) -> Ended | None:
         """Learn the length of a stay again from the relay's present switching, or fail."""
-        course, most = self._course, self._setup.parameters.max_cycles
-        course.usual = course.usual or usual_period(self.cycles)
+        course, most = self._course, self._run.parameters.max_cycles
+        course.usual = course.usual or usual_period(self._run.cycles)
         if fast := self._too_fast(2.0 * course.stays.longest, course.usual):
             return failed(fast)
-        if len(self.cycles) + course.stays.lost >= most:
+        if len(self._run.cycles) + course.stays.lost >= most:
             lost = course.stays.lost_for
-            return failed(Code.NO_CLEAR_CYCLE(time=lost, cycles=len(self.cycles), most=most))
+            return failed(Code.NO_CLEAR_CYCLE(time=lost, cycles=len(self._run.cycles), most=most))
         course.longest = course.stays.longest
         course.is_lost = True
         return None
@@ -356,21 +340,21 @@ class Switching:
         if len(at) <= _STAYS or last - first < TELL:
             return None
         # Noise may switch the relay many times while the measurement passes the band.
-        seen = self._setup.trace.seen
-        if seen[last] - seen[first] < _STAYS * self.facts.response_time:
+        seen = self._run.trace.seen
+        if seen[last] - seen[first] < _STAYS * self._run.facts.response_time:
             return None
         noise = self._noise_alone(first, last)
         if noise is None:
             return None
-        if not self._setup.levels.can_grow:
+        if not self._run.levels.can_grow:
             return failed(noise)
-        self._setup.levels.grow()
+        self._run.levels.grow()
         self._begin()
         return None
 
     def _runs_away(self, t: float, y: float) -> bool:
-        distance = y - self.facts.setpoint
-        if not self.cycles:
+        distance = y - self._run.facts.setpoint
+        if not self._run.cycles:
             return self._course.runaway.add(t, distance)
         self._away = self._away + 1 if abs(distance) > self._furthest else 0
         return self._away >= _RUNAWAY_SAMPLES
@@ -381,28 +365,28 @@ class Switching:
         It will not leave that, and the time to respond, by which a stay is limited, may hold the
         wait for a level that the process has answered at all.
         """
-        levels, course = self._setup.levels, self._course
+        levels, facts, course = self._run.levels, self._run.facts, self._course
         stay = t - course.relay.since
         if stay < course.look_after or not (levels.from_small and levels.can_grow):
             return False
         course.look_after = _RESTS_AFTER * stay
         time, measurement = self._since(course.relay.since + 0.5 * stay)
-        if len(time) < TELL or abs(y - self.facts.setpoint) >= self.facts.hysteresis:
+        if len(time) < TELL or abs(y - facts.setpoint) >= facts.hysteresis:
             return False
         return self._has_moved() and rest_state(time - time[0], measurement, len(time)).is_steady
 
     def _on_timeout(self, t: float, y: float) -> Ended | None:
         """Fail, unless the amplitude can grow or a doubtful sign can be reversed."""
-        levels, load = self._setup.levels, self._load
+        levels, load = self._run.levels, self._load
         # A half cycle beyond the noise shows that the process follows the relay both ways.
-        stays = self.switches - self._course.switches_before
-        follows = bool(self.cycles) or (stays >= _FOLLOWS and self._course.answers)
+        stays = self._run.switches - self._course.switches_before
+        follows = bool(self._run.cycles) or (stays >= _FOLLOWS and self._course.answers)
         # A constant measurement is no response at all; a saturated one still is.
         moved = self._has_moved()
         if self._is_doubtful and not follows and moved:
             self._is_doubtful = False
-            self._setup.notes.append(Code.NOTE_SIGN(sign=_SIGNS[self.facts.sign]))
-            self.facts = replace(self.facts, sign=-self.facts.sign)
+            self._run.notes.append(Code.NOTE_SIGN(sign=_SIGNS[self._run.facts.sign]))
+            self._run.facts.sign *= -1
             # What one level drove away takes as long to come back, and longer with a bias.
             load.waits_from = t + (t - self._course.relay.since) / levels.balance
             self._begin()
@@ -427,13 +411,13 @@ class Switching:
 
     def _since(self, time: float) -> tuple[FloatArray, FloatArray]:
         """Return time and measurement since an instant."""
-        trace = self._setup.trace
+        trace = self._run.trace
         return trace.columns(bisect_left(trace.seen, time), len(trace))[:2]
 
     def _why_lost(self, t: float, y: float) -> Reason:
-        relay, facts = self._course.relay, self.facts
+        relay, facts = self._course.relay, self._run.facts
         values: dict[str, Value] = {
-            "cycles": len(self.cycles),
+            "cycles": len(self._run.cycles),
             "value": y,
             "setpoint": facts.setpoint,
             "hysteresis": facts.hysteresis,
@@ -452,37 +436,37 @@ class Switching:
 
     def _begin_cycle(self) -> Ended | None:
         """Take the begin of a cycle, which ends the one before."""
-        course, p = self._course, self._setup.parameters
-        self.cycle_start += (len(self._setup.trace) - 1,)
-        if len(self.cycle_start) < 2:
-            course.fast.forget_cycle(self.switches)
+        course, run, p = self._course, self._run, self._run.parameters
+        run.cycle_start += (len(run.trace) - 1,)
+        if len(run.cycle_start) < 2:
+            course.fast.forget_cycle(run.switches)
             return None
         grown, clipped = self._has_grown()
         if clipped or grown:
-            course.fast.forget_cycle(self.switches)
+            course.fast.forget_cycle(run.switches)
             return failed(clipped) if clipped else None
         cycle = self._cycle_that_ended()
         was_lost, course.is_lost = course.is_lost, False
         if was_lost:
             cycle = replace(cycle, disturbed=True)
-        self.cycles += (cycle,)
+        run.cycles += (cycle,)
         for watch in _OF_CYCLES:
             if why := watch(self):
                 return failed(why)
-        n = len(self.cycles)
+        n = len(run.cycles)
         agreed: dict[str, Value] = {"percent": 100.0 * p.cycle_tolerance}
-        if self._setup.until_converged and cycle.converged:
+        if run.until_converged and cycle.converged:
             which = f"{n}" if n == p.min_cycles else f"the last {p.min_cycles} of {n}"
             return self._complete(Code.CYCLES_AGREE(which=which, cycles=n, **agreed))
         if n + course.stays.lost >= p.max_cycles:
-            more = {"needed": p.min_cycles, **agreed} if self._setup.until_converged else {}
+            more = {"needed": p.min_cycles, **agreed} if run.until_converged else {}
             return self._complete(Code.MAX_CYCLES(most=p.max_cycles, cycles=n, **more))
-        self._furthest = _RUNAWAY * max(cycle.amplitude for cycle in self.cycles)
+        self._furthest = _RUNAWAY * max(cycle.amplitude for cycle in run.cycles)
         # A cycle much longer than the one before may hold an actuator that stuck; a load would
         # show in the next cycle, too.
-        is_alone = n > 1 and cycle.period > _ALONE * self.cycles[-2].period
-        if not (was_lost or is_alone) and self._load.shows_in(self.cycles[-2:]):
-            self.cycles = (*self.cycles[:-1], replace(cycle, disturbed=True))
+        is_alone = n > 1 and cycle.period > _ALONE * run.cycles[-2].period
+        if not (was_lost or is_alone) and self._load.shows_in(run.cycles[-2:]):
+            run.cycles = (*run.cycles[:-1], replace(cycle, disturbed=True))
         return None
 
     def _has_grown(self) -> tuple[bool, Reason | None]:
@@ -490,22 +474,21 @@ class Switching:
 
         :return: whether it did, and why the actuator must be at its ends.
         """
-        setup, levels = self._setup, self._setup.levels
+        run, facts, levels = self._run, self._run.facts, self._run.levels
         if not levels.searching:
             return False, None
         swing, clear, y = self._last_swing()
-        facts = self.facts
-        least = sought_swing(setup.parameters, clear, facts.rest.noise_std, facts.setpoint, y)
+        least = sought_swing(run.parameters, clear, facts.rest.noise_std, facts.setpoint, y)
         if not levels.from_small and (why := levels.why_clipped(swing, settled=False)):
             return False, why
         levels.note_small(swing, clear)
         factor = levels.growth_for(swing.half, least)
         if factor is not None:
             levels.grow(factor)
-            self.cycle_start = self.cycle_start[-1:]
+            run.cycle_start = run.cycle_start[-1:]
             return True, None
         if swing.half < least and not levels.from_small:
-            setup.notes.append(
+            run.notes.append(
                 Code.NOTE_SMALL(amplitude=levels.amplitude, swing=swing.half, least=least)
             )
         levels.searching = False
@@ -513,22 +496,24 @@ class Switching:
 
     def _last_swing(self) -> tuple[Swing, float, FloatArray]:
         """Return the swing of the last cycle, half of the least clear one, and its samples."""
-        first, last = self.cycle_start[-2:]
-        time, y, _ = self._setup.trace.columns(first, last + 1)
-        clear = clear_swing(self.facts.rest.noise_std, self.facts.hysteresis, y)
+        run, facts = self._run, self._run.facts
+        first, last = run.cycle_start[-2:]
+        time, y, _ = run.trace.columns(first, last + 1)
+        clear = clear_swing(facts.rest.noise_std, facts.hysteresis, y)
         return Swing(0.5 * float(y.max() - y.min()), float(time[-1] - time[0])), clear, y
 
     def _cycle_that_ended(self) -> Cycle:
-        setup, p, noise = self._setup, self._setup.parameters, self.facts.rest.noise_std
-        first, last = self.cycle_start[-2:]
+        run, p = self._run, self._run.parameters
+        first, last = run.cycle_start[-2:]
         cycle = cycle_from_samples(
-            len(self.cycles),
-            *setup.trace.columns(first, last + 1),
-            middle=setup.baseline + setup.levels.bias,
-            reverse_acting=self.facts.sign < 0,
+            len(run.cycles),
+            *run.trace.columns(first, last + 1),
+            middle=run.baseline + run.levels.bias,
+            reverse_acting=run.facts.sign < 0,
         )
         interval = cycle.period / (last - first)
-        return next_cycle(self.cycles, cycle, interval, noise, p.min_cycles, p.cycle_tolerance)
+        noise = run.facts.rest.noise_std
+        return next_cycle(run.cycles, cycle, interval, noise, p.min_cycles, p.cycle_tolerance)
 
     # What a cycle shows.
 
@@ -536,27 +521,27 @@ class Switching:
         """Return a reason if a period is too short compared with the usual one."""
         if period >= _FAST * usual:
             return None
-        return Code.FAST_CYCLES(half=0.5 * period, cycles=len(self.cycles), usual=usual)
+        return Code.FAST_CYCLES(half=0.5 * period, cycles=len(self._run.cycles), usual=usual)
 
     def _fast_cycles(self) -> Reason | None:
-        last = max(c.period for c in self.cycles[-_FAST_CYCLES:])
+        last = max(c.period for c in self._run.cycles[-_FAST_CYCLES:])
         return self._too_fast(
-            last, self._course.usual or usual_period(self.cycles[:-_FAST_CYCLES])
+            last, self._course.usual or usual_period(self._run.cycles[:-_FAST_CYCLES])
         )
 
     def _chatter(self) -> Reason | None:
-        return self._course.fast.cycle(self.switches, len(self.cycles))
+        return self._course.fast.cycle(self._run.switches, len(self._run.cycles))
 
     def _growth(self) -> Reason | None:
-        growing = is_growing([cycle.amplitude for cycle in self.cycles])
-        return Code.GROWING(cycles=len(self.cycles)) if growing else None
+        growing = is_growing([cycle.amplitude for cycle in self._run.cycles])
+        return Code.GROWING(cycles=len(self._run.cycles)) if growing else None
 
     def _clipped(self) -> Reason | None:
         """Return why the actuator is at its ends, once the swing grows no more."""
-        levels = self._setup.levels
-        if not (levels.from_small and self.is_tried):
+        levels = self._run.levels
+        if not (levels.from_small and self._run.is_tried):
             return None
-        before, last = (Swing(cycle.amplitude, cycle.period) for cycle in self.cycles[-2:])
+        before, last = (Swing(cycle.amplitude, cycle.period) for cycle in self._run.cycles[-2:])
         grows = last.half > _STILL * before.half
         return None if grows else levels.why_clipped(last, settled=True)
 
@@ -565,30 +550,32 @@ class Switching:
 
         :param least: number of samples needed for a decision before MIN_CYCLES cycles.
         """
-        last_cycles = self.cycle_start[-min(len(self.cycles), MIN_CYCLES) - 1 :]
+        count = len(self._run.cycles)
+        last_cycles = self._run.cycle_start[-min(count, MIN_CYCLES) - 1 :]
         first, last = last_cycles[0], last_cycles[-1]
-        few = len(self.cycles) < MIN_CYCLES and last - first < least
+        few = count < MIN_CYCLES and last - first < least
         return None if few else self._noise_alone(first, last)
 
     def _noise_alone(self, first: int, last: int) -> Reason | None:
         """Return why the samples first to last - 1 are no oscillation, None if they may be one."""
-        measurement = self._setup.trace.columns(first, last)[1]
-        return why_noise_alone(measurement, self.facts.rest.noise_std, len(self.cycles))
+        run = self._run
+        measurement = run.trace.columns(first, last)[1]
+        return why_noise_alone(measurement, run.facts.rest.noise_std, len(run.cycles))
 
     def _complete(self, why: Reason) -> Ended:
         """Complete, unless the last cycles may be noise alone."""
-        levels, notes = self._setup.levels, self._setup.notes
+        run, levels = self._run, self._run.levels
         if noise := self._only_noise(1):
             return failed(noise)
         if levels.from_small and not levels.grew_enough:
             reach: dict[str, Value] = {"low": levels.low, "high": levels.high}
             swing, clear, _ = self._last_swing()
             # A quarter of this swing would have stood clear of the noise.
-            if not self.cycles[-1].converged or swing.half > _CLEARLY * clear:
+            if not run.cycles[-1].converged or swing.half > _CLEARLY * clear:
                 return failed(Code.REACH_UNKNOWN(**reach, **why.values))
-            notes.append(Code.NOTE_REACH(**reach))
-        if disturbed := sum(cycle.disturbed for cycle in self.cycles):
-            notes.append(Code.NOTE_DISTURBED(disturbed=disturbed, cycles=len(self.cycles)))
+            run.notes.append(Code.NOTE_REACH(**reach))
+        if disturbed := sum(cycle.disturbed for cycle in run.cycles):
+            run.notes.append(Code.NOTE_DISTURBED(disturbed=disturbed, cycles=len(run.cycles)))
         return Ended(State.COMPLETED, why)
 
 
