@@ -9,7 +9,6 @@ import math
 import re
 import time
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
 from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse
@@ -152,81 +151,29 @@ def refused(reason: Reason) -> StartTune.Response:
     return answer
 
 
-@dataclass
-class _Tune:
-    """A goal that is not answered yet.
+class TuneGoal:
+    """A goal of the action ~/tune whose tune has begun, until it is answered.
 
-    :param goal: its handle.
+    :param handle: of the goal.
     """
 
-    goal: Any
-    result: Tune.Result = field(default_factory=Tune.Result)
-    newest: TransferFunction = field(default_factory=TransferFunction)
-    """Model that is not published yet."""
-    model: Any = None
-    """The newest model, which is kept beyond the feedback that tells it."""
+    def __init__(self, handle: Any) -> None:
+        self._handle, self._result = handle, Tune.Result()
+        # The newest model, and the same until it is published.
+        self._model: Any = None
+        self._news = TransferFunction()
 
+    def is_of(self, handle: Any) -> bool:
+        """Return whether a handle is that of this goal."""
+        return bool(handle.goal_id == self._handle.goal_id)
 
-class TuneAction:
-    """Serve the action. A tune may begin while the one before waits for its gains.
+    def tell(self, experiment: RelayExperiment, status: str) -> None:
+        """Publish feedback.
 
-    :param node: the node.
-    :param ready: done once a tune may be asked for.
-    :param start: takes an amplitude [u] and whether it is a dry run; starts or checks a tune, and
-        says what became of it.
-    :param cancel: called with the id of an experiment when its client cancels it.
-    """
-
-    def __init__(
-        self,
-        node: ServedNode,
-        ready: Awaitable[None],
-        start: Callable[[float, bool], StartTune.Response],
-        cancel: Callable[[str], None],
-    ) -> None:
-        self._node, self._ready, self._start, self._cancel = node, ready, start, cancel
-        self._tunes: dict[str, _Tune] = {}
-        self._server = serve_goals(
-            node, Tune, "~/tune", self._accept, self._on_cancel,
-            status_pub_qos_profile=quality.STATUS,
-        )  # fmt: skip
-
-    def _on_cancel(self, goal: Any) -> None:
-        for experiment_id, tune in [*self._tunes.items()]:
-            if goal.goal_id == tune.goal.goal_id:
-                self._cancel(experiment_id)
-
-    def _accept(self, goal: Any) -> None:
-        self._node.executor.create_task(self._begin, goal)
-
-    async def _begin(self, goal: Any) -> None:
-        request = goal.request
-        await self._ready
-        if goal.is_cancel_requested:
-            started = refused(Code.CANCELLED())
-        else:
-            started = self._start(request.amplitude, request.dry_run)
-        if started.experiment_id:
-            self._tunes[started.experiment_id] = _Tune(goal)
-            return
-        result = Tune.Result(
-            reason=started.reason,
-            why=started.why,
-            checks=started.checks,
-            refusals=started.refusals,
-        )
-        conclude(goal, result, succeeded=started.accepted)
-
-    def tell(self, experiment_id: str, experiment: RelayExperiment, status: str) -> None:
-        """Publish feedback, if the experiment has a goal.
-
-        :param experiment_id: its id.
         :param experiment: what it sees.
         :param status: what it waits for and what it sees, a sentence.
         """
-        tune = self._tunes.get(experiment_id)
-        if tune is None:
-            return
+        model = self._model
         # The probe is a second kick.
         state = State.KICK if experiment.state is State.PROBE else experiment.state
         feedback = Tune.Feedback(
@@ -237,18 +184,18 @@ class TuneAction:
             remaining=experiment.remaining,
             period=math.nan,
             amplitude=math.nan,
-            ultimate_gain=tune.model.ultimate_gain if tune.model else math.nan,
-            ultimate_gain_std=tune.model.ultimate_gain_std if tune.model else math.nan,
-            transfer_function=tune.newest,
+            ultimate_gain=model.ultimate_gain if model else math.nan,
+            ultimate_gain_std=model.ultimate_gain_std if model else math.nan,
+            transfer_function=self._news,
             status=status,
         )
         if experiment.cycle_count:
             last = experiment.cycles[-1]
             feedback.period = last.period
             feedback.amplitude = last.amplitude
-        tune.goal.publish_feedback(feedback)
+        self._handle.publish_feedback(feedback)
         # Each model is published once, since it is long.
-        tune.newest = TransferFunction()
+        self._news = TransferFunction()
 
     def note(self, name: str, message: Any) -> None:
         """Keep a model or gains for the result.
@@ -256,28 +203,21 @@ class TuneAction:
         :param name: unresolved name of its topic.
         :param message: the message.
         """
-        tune = self._tunes.get(message.experiment_id)
-        if tune is None:
-            return
         if name == "transfer_function":
-            tune.newest = tune.model = message
+            self._news = self._model = message
             if message.final:
-                tune.result.transfer_function = message
+                self._result.transfer_function = message
         elif message.final:
-            tune.result.gains = message
+            self._result.gains = message
 
-    def end(self, experiment_id: str, summary: Any, bag: str, missing: str) -> None:
-        """Answer the goal of an experiment; do nothing if it has no goal.
+    def end(self, summary: Any, bag: str, missing: str) -> None:
+        """Answer it.
 
-        :param experiment_id: the id of the experiment.
-        :param summary: its message, without arrays.
+        :param summary: the experiment's message, without arrays.
         :param bag: folder of the recording; empty: no recording.
         :param missing: a sentence on samples or results that are missing; empty: none are.
         """
-        tune = self._tunes.pop(experiment_id, None)
-        if tune is None:
-            return
-        result = tune.result
+        result = self._result
         result.experiment = summary
         result.bag = bag
         result.outcome = summary.outcome
@@ -290,4 +230,40 @@ class TuneAction:
         result.verdict_why = judged.verdict_why
         if not (judged.verdict_reason or given):
             result.verdict_why = result.why
-        conclude(tune.goal, result, succeeded=summary.outcome == Tune.Result.COMPLETED)
+        conclude(self._handle, result, succeeded=summary.outcome == Tune.Result.COMPLETED)
+
+
+def serve_tunes(
+    node: ServedNode,
+    ready: Awaitable[None],
+    start: Callable[[float, bool, TuneGoal], StartTune.Response],
+    cancel: Callable[[Any], None],
+) -> ActionServer:
+    """Serve the action. A tune may begin while the one before waits for its gains.
+
+    :param node: the node.
+    :param ready: done once a tune may be asked for.
+    :param start: takes an amplitude [u], whether it is a dry run, and the goal, which it keeps if
+        a tune has begun; says what became of it.
+    :param cancel: called with the handle of a goal that its client cancels.
+    """
+
+    async def begin(handle: Any) -> None:
+        request = handle.request
+        await ready
+        if handle.is_cancel_requested:
+            started = refused(Code.CANCELLED())
+        else:
+            started = start(request.amplitude, request.dry_run, TuneGoal(handle))
+        if not started.experiment_id:
+            said = {n: getattr(started, n) for n in ("reason", "why", "checks", "refusals")}
+            conclude(handle, Tune.Result(**said), succeeded=started.accepted)
+
+    return serve_goals(
+        node,
+        Tune,
+        "~/tune",
+        lambda handle: node.executor.create_task(begin, handle),
+        cancel,
+        status_pub_qos_profile=quality.STATUS,
+    )

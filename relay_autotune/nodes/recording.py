@@ -104,6 +104,11 @@ class Recording:
         """True once nothing more can be recorded."""
         return self._closing.is_set()
 
+    @property
+    def is_waiting(self) -> bool:
+        """True while it waits for model and gains after the end of the tune."""
+        return self._timer is not None
+
     def message(self, name: str, time_ns: int, message: Any) -> None:
         """Record another message; ignore it if the recording is closed.
 
@@ -151,7 +156,7 @@ class Recording:
 
         :param timeout: as of `close_with_results` [s].
         """
-        if self._timer is None:
+        if not self.is_waiting:
             return ""
         now = time.monotonic()
         is_there = self._node.count_publishers(self._names["pi_gains"]) > 0
@@ -183,10 +188,12 @@ class Recording:
         )
 
     def wait_no_longer(self, reason: str) -> None:
-        """Close it without the results that it lacks.
+        """Close it without the results that it lacks, if it waits for them.
 
         :param reason: why they are missing, unless identifier_node has given another one.
         """
+        if not self.is_waiting:
+            return
         self._reason = self._reason or reason
         self.close(f"without {' and '.join(self._missing)}: {self._reason}")
 
@@ -273,8 +280,8 @@ class Recordings:
 
     def __init__(self, node: Node, ends: Callable[[], dict[str, Any]]) -> None:
         self._node, self._ends = node, ends
-        # By experiment, the newest last.
-        self._kept: dict[str, Recording] = {}
+        # The newest last.
+        self._kept: list[Recording] = []
         self._reported = ""
 
     def begin(self, experiment_id: str, directory: str) -> Recording:
@@ -285,37 +292,17 @@ class Recordings:
         """
         # Absolute, since whoever reads the path may be in another folder.
         folder = Path(directory).expanduser().absolute() / experiment_id
-        self._kept = {name: each for name, each in self._kept.items() if not each.is_closed}
-        self._kept[experiment_id] = recording = Recording(self._node, self._ends(), folder)
+        recording = Recording(self._node, self._ends(), folder)
+        self._kept = [*(each for each in self._kept if not each.is_closed), recording]
         return recording
-
-    @property
-    def _newest(self) -> Recording | None:
-        return next(reversed(self._kept.values()), None)
 
     def problem(self) -> str:
         """Return what is wrong with the newest recording, or ""; a new problem is logged."""
-        problem = "" if self._newest is None else self._newest.failure
+        problem = self._kept[-1].failure if self._kept else ""
         if problem and problem != self._reported:
             self._reported = problem
             self._node.get_logger().error(f"the tune goes on, but {problem}")
         return problem
-
-    def message(self, experiment_id: str, name: str, time_ns: int, message: Any) -> None:
-        """Record a message of an experiment; ignore it if no such recording is open.
-
-        :param experiment_id: the id of the experiment.
-        """
-        if (recording := self._kept.get(experiment_id)) is not None:
-            recording.message(name, time_ns, message)
-
-    def note_progress(self, experiment_id: str, working: bool, text: str) -> None:
-        """Take a sign of life of the identifier, as `Recording.note_progress`.
-
-        :param experiment_id: the experiment that it works on, or has finished.
-        """
-        if (recording := self._kept.get(experiment_id)) is not None:
-            recording.note_progress(working, text)
 
     def close_all(self, why: str, timeout: float) -> None:
         """Close all recordings and wait for the newest to be finished.
@@ -323,9 +310,9 @@ class Recordings:
         :param why: end of the sentence "the recording is closed ...".
         :param timeout: how long to wait at most [s].
         """
-        for recording in self._kept.values():
+        for recording in self._kept:
             recording.close(why)
-        if (newest := self._newest) is not None and not newest.join(timeout):
+        if self._kept and not self._kept[-1].join(timeout):
             self._node.get_logger().error(
-                f"the recording {newest.path} could not be finished within {timeout:g} s"
+                f"the recording {self._kept[-1].path} could not be finished within {timeout:g} s"
             )

@@ -21,7 +21,7 @@ from relay_autotune.errors import FieldError, NotReadyError, ParameterError
 from relay_autotune.exchange.messages import finding_from_message, set_stamp
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
-from relay_autotune.nodes.goals import Narrator, TuneAction, refused, serve
+from relay_autotune.nodes.goals import Narrator, TuneGoal, refused, serve, serve_tunes
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import command_reader, reader_of
 from relay_autotune.nodes.loop_ends import LoopSupervisor, RelayTopics
@@ -77,7 +77,7 @@ class RelayNode(ServedNode):
             self._now_ns if self._simulated else time.time_ns,
             on_measurement=self._on_measurement,
             on_result=self._on_result,
-            on_status=lambda status: self._recordings.note_progress(*said_by(status)),
+            on_status=lambda status: self._on_status(*said_by(status)),
         )
         self._send, self._relay = self._ends.command.send, self._ends.relay.send
         self._on_setpoint = self._ends.setpoint is not None
@@ -93,9 +93,9 @@ class RelayNode(ServedNode):
         waiting = ReentrantCallbackGroup()
         self.create_service(StartTune, "~/start_tune", self._on_start, callback_group=waiting)
         serve(self, Trigger, "~/abort", self._abort)
-        self._action = TuneAction(self, self._arrival, self._request, self._cancel)
-        # Those whose gains are awaited, by their ids.
-        self._waiting: dict[str, Session] = {}
+        self._action = serve_tunes(self, self._arrival, self._request, self._cancel)
+        # The tune that runs, and before it those whose gains are awaited, by their ids.
+        self._tunes: dict[str, Session] = {}
         self._narrator = Narrator(self, self._words, self._tell)
         self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         require_settable(self, (), self._running)
@@ -184,7 +184,9 @@ class RelayNode(ServedNode):
         await self._arrival
         return self._request(request.amplitude, request.dry_run)
 
-    def _request(self, amplitude: float, dry_run: bool) -> StartTune.Response:
+    def _request(
+        self, amplitude: float, dry_run: bool, goal: TuneGoal | None = None
+    ) -> StartTune.Response:
         if self._session is not None:
             return self._refuse(Code.RUNNING(tune=self._session.id, node=self._name))
         checks = Checklist()
@@ -195,7 +197,7 @@ class RelayNode(ServedNode):
         if dry_run:
             reason = f"a tune could start: {ready.plan}; {takes}"
             return answer_of(checks, accepted=True, reason=reason)
-        identity, recorded = self._start(ready)
+        identity, recorded = self._start(ready, goal)
         reason = f"{ready.plan}; {recorded}; {takes}"
         self.get_logger().info(f"tune {identity} started: {reason}")
         reason += f"; watch {WATCH.format(self._name)}"
@@ -205,7 +207,7 @@ class RelayNode(ServedNode):
         self.get_logger().warning(f"start refused: {why}")
         return refused(why)
 
-    def _start(self, ready: Ready) -> tuple[str, str]:
+    def _start(self, ready: Ready, goal: TuneGoal | None) -> tuple[str, str]:
         parameters, policy = ready.parameters, ready.policy
         identity = f"{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}_{secrets.token_hex(4)}"
         converged = self.get_parameter("stop_when").value == "converged"
@@ -228,13 +230,14 @@ class RelayNode(ServedNode):
             clock=self._now_ns if self._simulated else None,
             repeats=self._hear is not None,
             one_clock=self._reported is not None,
+            goal=goal,
         )
         if not converged:
             sought = self.get_parameter("confident_of").value
             session.early = EarlyEnd(sought, self.get_parameter("confidence").value)
         self._sensor.samples.forget()
         self._alarm = ""
-        self._session = session
+        self._session = self._tunes[identity] = session
         self._loop.take(session.experiment, gives_back=policy.give_back)
         self.defer(self._narrator.now)
         return identity, self._recordings.problem() or f"recorded in {recording.path}"
@@ -282,13 +285,13 @@ class RelayNode(ServedNode):
         now = self._now_ns()
         taken = self._results.take(name, message, running, self._on_setpoint)
         for topic, found in taken:
-            self._action.note(topic, found)
-            self._recordings.message(found.experiment_id, topic, now, found)
+            if (tune := self._tunes.get(found.experiment_id)) is not None:
+                tune.recording.message(topic, now, found)
+                if tune.goal is not None:
+                    tune.goal.note(topic, found)
         if name == MODEL and message.final and not taken:
             # Gains without a model are no result: waiting longer brings nothing.
-            self._recordings.note_progress(
-                message.experiment_id, False, self._results.refusals.last
-            )
+            self._on_status(message.experiment_id, False, self._results.refusals.last)
         if running is None or not taken:
             return
         self._tell(running.experiment.status)
@@ -298,18 +301,26 @@ class RelayNode(ServedNode):
             self._send_safe(command := running.experiment.conclude(reason))
             self._leave(running, command)
 
+    def _on_status(self, experiment_id: str, working: bool, text: str) -> None:
+        """Take a sign of life of the identifier, as `Recording.note_progress`."""
+        if (tune := self._tunes.get(experiment_id)) is not None:
+            tune.recording.note_progress(working, text)
+
     # Ending.
 
     def _stop_now(self, reason: Reason) -> None:
         if (session := self._session) is not None:
             self._stop(session, reason)
 
-    def _cancel(self, experiment_id: str) -> None:
+    def _cancel(self, handle: Any) -> None:
         """End a tune at its client's wish, also one that waits for its model alone."""
-        if experiment_id == self._running:
-            self._stop_now(Code.CANCELLED())
-        elif experiment_id in self._waiting:
-            self._waiting[experiment_id].recording.wait_no_longer("cancelled")
+        for tune in [*self._tunes.values()]:
+            if tune.goal is None or not tune.goal.is_of(handle):
+                continue
+            if tune is self._session:
+                self._stop(tune, Code.CANCELLED())
+            else:
+                tune.recording.wait_no_longer("cancelled")
 
     def _stop(self, session: Session, reason: Reason) -> bool:
         """End a running tune; return True if the safe command was acknowledged."""
@@ -351,15 +362,16 @@ class RelayNode(ServedNode):
         if session.sample_count:
             self._results.experiment(message)
         session.recording.message("relay_experiment", session.now_ns(), message)
-        self._waiting[session.id] = session
-        self._action.tell(session.id, experiment, experiment.status)
+        if (goal := session.goal) is not None:
+            goal.tell(experiment, experiment.status)
         self.tidy_when_idle()
 
         def closed(missing: str) -> None:
-            del self._waiting[session.id]
+            del self._tunes[session.id]
             bag = "" if self._recordings.problem() else str(session.recording.path)
-            summary = session.message(arrays=False)
-            self._action.end(session.id, summary, bag, "; ".join(filter(None, (lost, missing))))
+            if goal is not None:
+                without = "; ".join(filter(None, (lost, missing)))
+                goal.end(session.message(arrays=False), bag, without)
 
         if completed:
             timeout = self.get_parameter("model_timeout").value
@@ -390,7 +402,7 @@ class RelayNode(ServedNode):
         """Say what the tune waits for and sees; empty where none runs or waits for its model."""
         if (session := self._session) is None:
             timeout = self.get_parameter("model_timeout").value
-            waiting = self._last_waiting
+            waiting = self._told
             return "" if waiting is None else waiting.recording.awaited(timeout)
         sentence = session.experiment.status
         if (age := self._sensor.age) > max(SILENT, 2.0 * self._sensor.samples.interval):
@@ -400,12 +412,14 @@ class RelayNode(ServedNode):
 
     def _tell(self, status: str) -> None:
         """Send feedback of the tune that runs, or that waits for its model."""
-        if (session := self._session or self._last_waiting) is not None:
-            self._action.tell(session.id, session.experiment, status)
+        if (tune := self._told) is not None and tune.goal is not None:
+            tune.goal.tell(tune.experiment, status)
 
     @property
-    def _last_waiting(self) -> Session | None:
-        return next(reversed(self._waiting.values()), None)
+    def _told(self) -> Session | None:
+        """The tune that runs, else the last that waits for its model."""
+        waiting = (t for t in reversed(self._tunes.values()) if t.recording.is_waiting)
+        return self._session or next(waiting, None)
 
     def _lost(self) -> int:
         # Sequence numbers of several publishers cannot be distinguished.

@@ -31,6 +31,7 @@ from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.faults import ClockWatch
 from relay_autotune.experiment.phases import State
+from relay_autotune.nodes.goals import TuneGoal
 from relay_autotune.nodes.quality import QUIET_AFTER_GO
 from relay_autotune.nodes.recording import Recording, Sample
 from relay_autotune.record.record import Record, RelaySettings
@@ -54,6 +55,7 @@ class Session:
     :param clock: the simulated clock [ns]; None: time is real.
     :param repeats: True if a measurement is a sample again while the sensor is silent.
     :param one_clock: True if the stamp of a sample is the time of the command, too.
+    :param goal: of the action; None: the service has started it.
     """
 
     def __init__(
@@ -64,8 +66,10 @@ class Session:
         clock: Callable[[], int] | None = None,
         repeats: bool = False,
         one_clock: bool = False,
+        goal: TuneGoal | None = None,
     ) -> None:
         self.experiment = experiment
+        self.goal = goal
         self.id = experiment.experiment_id
         self.recording = recording
         self.start_ns = 0

@@ -56,7 +56,7 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
         recording.sample((1, 1, 1.0, 1, 0.5))
         if complete:
             for name, kind in results.items():
-                recordings.message(experiment, name, 2, kind(final=True))
+                recording.message(name, 2, kind(final=True))
         closed: list[str] = []
         recording.close_with_results(0.05, closed.append)
         # What the identifier is at goes on, as it says it.
@@ -69,12 +69,12 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
         assert [said_by(sign) for sign in signs] == [
             (experiment, True, ""), (experiment, True, "comparing structures"),
         ]  # fmt: skip
-        recordings.note_progress(*said_by(signs[-1]))
+        recording.note_progress(*said_by(signs[-1])[1:])
         waits_for = recording.awaited(0.05)
         assert waits_for.endswith("s: comparing structures") is not complete
         # The identifier has sent all, of which the model was refused.
-        recordings.note_progress(experiment, False, "the model was refused")
-        recordings.note_progress(experiment, False, "")
+        recording.note_progress(False, "the model was refused")
+        recording.note_progress(False, "")
         for _ in range(PATIENCE):
             if closed:
                 break
@@ -121,7 +121,7 @@ def test_it_waits_as_long_as_the_identifier_gets_on(
     recording.close_with_results(10.0, closed.append)
     for stage in (*(f"stage {k}" for k in range(20)), *["the last one"] * 5):
         now[0] += 100.0
-        recordings.note_progress("slow", True, stage)
+        recording.note_progress(True, stage)
     assert now[0] == 2500.0
     waits_for = recording.awaited(10.0)
     assert waits_for.startswith("waiting for identifier_node")
