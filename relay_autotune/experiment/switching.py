@@ -163,7 +163,6 @@ class _Course:
         """Samples at which it switched last."""
         self.look_after = _RESTS_AFTER * facts.response_time
         """Length of the present stay at which it is looked whether the measurement rests [s]."""
-        self.switches_before = run.switches
         self.began = t
         self.fast = _FastWatch(run.switches)
         floor = max(facts.hysteresis, abs(y - facts.setpoint), 3.0 * facts.rest.noise_std)
@@ -377,10 +376,9 @@ class Switching:
 
     def _on_timeout(self, t: float, y: float) -> Ended | None:
         """Fail, unless the amplitude can grow or a doubtful sign can be reversed."""
-        levels, load = self._run.levels, self._load
+        levels, load, course = self._run.levels, self._load, self._course
         # A half cycle beyond the noise shows that the process follows the relay both ways.
-        stays = self._run.switches - self._course.switches_before
-        follows = bool(self._run.cycles) or (stays >= _FOLLOWS and self._course.answers)
+        follows = bool(self._run.cycles) or (course.relay.switches >= _FOLLOWS and course.answers)
         # A constant measurement is no response at all; a saturated one still is.
         moved = self._has_moved()
         if self._is_doubtful and not follows and moved:
@@ -388,7 +386,7 @@ class Switching:
             self._run.notes.append(Code.NOTE_SIGN(sign=_SIGNS[self._run.facts.sign]))
             self._run.facts.sign *= -1
             # What one level drove away takes as long to come back, and longer with a bias.
-            load.waits_from = t + (t - self._course.relay.since) / levels.balance
+            load.waits_from = t + (t - course.relay.since) / levels.balance
             self._begin()
             return None
         if levels.can_grow:
@@ -398,7 +396,7 @@ class Switching:
         if follows and moved and load.may_push():
             # It did oscillate before: a load may be too large for one of the levels.
             before = self.command
-            load.push(1 if self._course.is_high else -1)
+            load.push(1 if course.is_high else -1)
             if self.command != before:
                 load.pushed(t, self._limit)
                 return None
