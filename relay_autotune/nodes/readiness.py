@@ -84,12 +84,11 @@ class Checklist:
         """Why each check that failed did so."""
         return [check.why for check in self.checks if check.mark is Mark.NO]
 
-    def do(self, name: str, work: Callable[[], _T], found: Callable[[_T], str]) -> _T | None:
+    def do(self, name: str, work: Callable[[], _T]) -> _T | None:
         """Make a check.
 
         :param name: what is looked at.
-        :param work: returns what it finds, or raises the reason not to start.
-        :param found: says what was found.
+        :param work: returns what it finds, as people read it, or raises the reason not to start.
         :return: what was found; None: it failed.
         """
         try:
@@ -98,7 +97,7 @@ class Checklist:
             why = reason_of(error)
             self.checks.append(ChecklistLine(Mark.NO, name, str(why), why))
             return None
-        self.checks.append(ChecklistLine(Mark.OK, name, found(value)))
+        self.checks.append(ChecklistLine(Mark.OK, name, str(value)))
         return value
 
     def tell(self, name: str, found: str | Reason, mark: Mark = Mark.OK) -> None:
@@ -143,9 +142,8 @@ class Ready:
     from_small: bool
     period: float
 
-    @property
-    def plan(self) -> str:
-        """A sentence on the commands of the tune."""
+    def __str__(self) -> str:
+        """Return a sentence on the commands of the tune."""
         parameters, baseline = self.parameters, self.baseline
         levels = Levels(parameters, baseline)
         between = f"{levels.low:g} and {levels.high:g} u"
@@ -202,20 +200,11 @@ class Readiness:
         if amplitude != 0.0:
             chosen["amplitude"] = amplitude
         parameters = ExperimentParameters(**chosen)
-        planned = partial(self._planned, values, parameters, held, last)
-        ready = checks.do("levels", planned, lambda found: found.plan)
-        checks.do("measurement", self._require_measurement, lambda _: self._heard())
-        checks.do("command", self._require_actuator, lambda _: self._served())
-        checks.do(
-            "alone",
-            partial(self._require_alone, values["sample_period"]),
-            lambda _: "no other node commands, measures, or has this name",
-        )
-        checks.do(
-            "present",
-            partial(_require_within_limits, parameters, self._sensor.samples.newest),
-            lambda _: "the measurement is within its limits",
-        )
+        ready = checks.do("levels", partial(self._planned, values, parameters, held, last))
+        checks.do("measurement", self._measured)
+        checks.do("command", self._commanded)
+        checks.do("alone", partial(self._alone, values["sample_period"]))
+        checks.do("present", partial(_within, parameters, self._sensor.samples.newest))
         checks.tell("limits", _limits_of(parameters))
         checks.tell("at rest", _rest_of(self._sensor.samples))
         checks.tell("recording", _recording_in(values["record_directory"]))
@@ -257,9 +246,9 @@ class Readiness:
         period = last[1].period if last is not None else math.nan
         return Ready(parameters, baseline, policy, from_small, period)
 
-    def _require_measurement(self) -> None:
-        """Refuse a start without measurements, with the reason as far as the graph shows it."""
-        node, ends = self._node, self._ends
+    def _measured(self) -> str:
+        """Say who measures, and how; refuse a start without measurements, as the graph shows."""
+        node, ends, last = self._node, self._ends, self._sensor.samples
         if node.get_parameter("use_sim_time").value and node.get_clock().now().nanoseconds == 0:
             raise NotReadyError(Code.NO_CLOCK())
         if dead := self._sensor.why_dead():
@@ -273,41 +262,35 @@ class Readiness:
                 if math.isinf(age)
                 else Code.NO_MEASUREMENT_NOW(silence=age, why=why)
             )
-
-    def _heard(self) -> str:
-        """Say who measures, and how."""
-        topic, last = self._ends.measurement.topic_name, self._sensor.samples
-        rate = "rate not known yet"
+        topic, rate = ends.measurement.topic_name, "rate not known yet"
         if last.are_enough:
             rate = f"{1.0 / last.interval:.3g} per second"
         newest = "" if last.newest is None else f", newest {last.newest:.6g} y"
-        sources = ", ".join(map(described, self._node.get_publishers_info_by_topic(topic)))
+        sources = ", ".join(map(described, node.get_publishers_info_by_topic(topic)))
         return f"{topic} from {sources}, {rate}{newest}"
 
-    def _require_actuator(self) -> None:
-        """Refuse a start without a subscriber to the commands, with the reason."""
+    def _commanded(self) -> str:
+        """Say who takes the commands; refuse a start if nobody does, or they are not whole."""
+        node, sent = self._node, self._ends.own
+        topic, messages = sent.topic, sent.messages
         # In takeover one of the subscriptions is the node's own.
-        messages, sent = self._ends.own.messages, self._ends.own.publisher
-        own = sum(s.topic_name == sent.topic_name for s in self._node.subscriptions)
-        if sent.get_subscription_count() <= own:
-            why = why_unconnected(self._node, sent.topic_name, messages.type_name, hears=False)
+        own = sum(s.topic_name == topic for s in node.subscriptions)
+        if sent.publisher.get_subscription_count() <= own:
+            why = why_unconnected(node, topic, messages.type_name, hears=False)
             raise NotReadyError(Code.NO_SUBSCRIBER(why=why))
         if unknown := messages.why_unknown:
             raise NotReadyError(Code.OTHERS_NOT_THERE(why=unknown))
-
-    def _served(self) -> str:
-        """Say who takes the commands."""
-        own, mine = self._ends.own, self._node.get_fully_qualified_name()
-        there = self._node.get_subscriptions_info_by_topic(own.topic)
+        there, mine = node.get_subscriptions_info_by_topic(topic), node.get_fully_qualified_name()
         takers = ", ".join(described(e) for e in there if who(e) != mine)
-        return f"{own.messages.described} on {own.topic} to {takers}"
+        return f"{messages.described} on {topic} to {takers}"
 
-    def _require_alone(self, sample_period: float) -> None:
+    def _alone(self, sample_period: float) -> str:
         require_own_time(sample_period, self._sensor.repeat_period, self._loop.repeat_period)
         self._loop.require_alone()
+        return "no other node commands, measures, or has this name"
 
 
-def _require_within_limits(parameters: ExperimentParameters, newest: float | None) -> None:
+def _within(parameters: ExperimentParameters, newest: float | None) -> str:
     """Refuse a start whose first sample would end the tune.
 
     :param parameters: the experiment's parameters.
@@ -316,7 +299,7 @@ def _require_within_limits(parameters: ExperimentParameters, newest: float | Non
     """
     low, high = parameters.measurement_min, parameters.measurement_max
     if newest is None or low <= newest <= high:
-        return
+        return "the measurement is within its limits"
     limit, way = ("measurement_min", "lower") if newest < low else ("measurement_max", "higher")
     raise NotReadyError(Code.BEYOND_LIMITS(value=newest, low=low, high=high, way=way, limit=limit))
 

@@ -671,7 +671,7 @@ def test_a_plan_that_relay_node_refuses_marks_the_answer_to_change() -> None:
     found = Checklist()
     # a note asks for nothing
     found.tell("limits", Code.NO_LIMITS(missing="measurement_min", limit="measurement_min"))
-    found.do("levels", one_way, str)
+    found.do("levels", one_way)
     client: Any = Looker(measures=44.0)
     client.name, client.succeeded, client.not_ready_yet = "/relay_node", False, False
     answer = answer_of(found, accepted=False)
