@@ -360,17 +360,14 @@ class GainsKeeper:
             self.history = goal
             return await self._kept(goal)
         # Gains before journal: the journal already marks these gains as not trusted.
-        self._goal, self._anothers = goal, False
-        await self._settle()
+        await self._settle(goal)
         return self._open() or f"; {self._place.sentence(self.history.gains)} again"
 
     async def abandon(self) -> None:
         """Undo an unfinished change, before the end of the process, if the gains outlive it."""
         goal = self._permitted().cut_short()
-        if self._place.outlives and goal.work is not self.history.work:
-            self._abandoned = True
-            self._goal, self._anothers = goal, False
-        await self._settle()
+        self._abandoned = self._place.outlives and goal.work is not self.history.work
+        await self._settle(goal if self._abandoned else None)
         if left := self._open():
             self._node.get_logger().error(f"{left.lstrip('; ')}, once this node runs again")
 
@@ -403,8 +400,7 @@ class GainsKeeper:
         try:
             await self._place.put(wanted.gains)
         except RelayAutotuneError as error:
-            self._goal, self._anothers = now, False
-            await self._settle()
+            await self._settle(now)
             why = reason_of(error)
             raise type(error)(replace(why, said=f"{why}{self._open()}")) from error
         if self._abandoned:
@@ -438,8 +434,13 @@ class GainsKeeper:
             f"{f' ({self._reported})' if self._reported else ''}"
         )
 
-    async def _settle(self) -> None:
-        """Apply the goal state to the place; if it does not answer, try again later."""
+    async def _settle(self, wanted: GainsHistory | None = None) -> None:
+        """Apply the goal state to the place; if it does not answer, try again later.
+
+        :param wanted: a new goal, of gains that this node has sent itself; None: that of before.
+        """
+        if wanted is not None:
+            self._goal, self._anothers = wanted, False
         goal, left = self._goal, self.history.gains
         if goal is None:
             return
