@@ -59,8 +59,8 @@ class CommandPublisher:
         self.topic: str = self.publisher.topic_name
         # Looked up once, because they are called for each measurement.
         self._written, self._publish = messages.written, self.publisher.publish
-        self.sent: Callable[[float], None] | None = None
-        """Called with each number before it is published."""
+        self.own: deque[float] | None = None
+        """Gets each number as its receivers read it, before it is published; None: not kept."""
         self.last: float | None = None
         """The number published last; None: there was none."""
         self.is_fresh = False
@@ -71,8 +71,8 @@ class CommandPublisher:
         message = self._written(value)
         if message is None:
             return
-        if self.sent is not None:
-            self.sent(value)
+        if self.own is not None:
+            self.own.append(self.messages.on_wire(value))
         self._publish(message)
         self.last, self.is_fresh = value, True
 
@@ -295,7 +295,6 @@ class LoopSupervisor:
         # Time of the last feedback; inf: there is no feedback.
         self._feedback_at = math.inf
         self._follow: watch.FollowWatch | None = None
-        self._own: deque[float] = deque(maxlen=_OWN_KEPT)
         self._hold = node.create_publisher(Bool, "hold_request", quality.RESULT)
         self._hold.publish(Bool(data=False))
         self._messages = ends.own.messages
@@ -303,7 +302,7 @@ class LoopSupervisor:
         kind, often = self._messages.kind, quality.MEASUREMENT
         hears = partial(quality.subscription, node)
         if takeover:
-            ends.command.sent = self._note_own
+            self._own = ends.command.own = deque[float](maxlen=_OWN_KEPT)
             hears(kind, "command", self._on_command, quality.COMMAND)
         elif not ends.is_reported:
             self._controller = hears(Float64, "controller_command", self._on_controller, often)
@@ -477,9 +476,6 @@ class LoopSupervisor:
             self._driven, self.problem = True, ""
         elif self._gives_back and self._experiment is not None and self.is_connected:
             self._experiment.safe_command = self.handover.last
-
-    def _note_own(self, command: float) -> None:
-        self._own.append(self._messages.on_wire(command))
 
     def _on_command(self, message: Any) -> None:
         """Take a message on the command topic, where other nodes may publish, too."""
