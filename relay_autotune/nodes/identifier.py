@@ -77,7 +77,8 @@ class IdentifierNode(ServedNode):
         # The method li takes the last two experiments together.
         self._earlier: Record | None = None
         self._waiting: deque[_Fit] = deque()
-        self._is_fitting = self._is_asked = False
+        # From the wish for a fit until nothing is left to be fitted.
+        self._is_busy = False
         self._cycles_are_new = False
         self._progress: Any = None
         self._running, self._running_fit = "", RunningFit()
@@ -178,20 +179,19 @@ class IdentifierNode(ServedNode):
 
     def _look(self) -> None:
         """Start a fit once no message waits, unless one is running."""
-        if not (self._is_fitting or self._is_asked):
-            self._is_asked = True
+        if not self._is_busy:
+            self._is_busy = True
             self.defer_until_idle(self._begin)
 
     def _begin(self) -> None:
-        self._is_asked = False
         fit = self._waiting.popleft() if self._waiting else self._of_running()
         if fit is None:
+            self._is_busy = False
             return
-        self._is_fitting = True
         work, take = fit
 
         def taken(found: Any) -> None:
-            self._is_fitting = False
+            self._is_busy = False
             try:
                 take(found)
             finally:

@@ -50,7 +50,7 @@ def work_off(node: IdentifierNode) -> None:
     """Let the node do all that it has begun, as its process does."""
     deadline = time.monotonic() + 120.0
     more = True
-    while more or node._is_fitting:
+    while more or node._is_busy:
         busy = node.executor.turn(0.0 if more else 0.05)
         more = node.work(idle=not busy)
         assert time.monotonic() < deadline
