@@ -106,7 +106,7 @@ def _topics(file: str) -> dict[str, str]:
 # How long the end of the process waits for the acknowledgement of its last message.
 ACKNOWLEDGE = Duration(seconds=0.2)
 NAMES_OF_GAINS = frozenset(entry.name for entry in tables.GAINS)
-# Interval of the looks for a sensor that only offers best effort [s].
+# Interval of the looks at a proof, and for a sensor that only offers best effort [s].
 _LOOK_EVERY = 0.2
 # How long the end of the process may wait for another node to restore its gains [s].
 END_WITHIN = 5.0
@@ -188,9 +188,9 @@ class ControllerNode(ServedNode):
         if values["repeat_period"] > 0.0:
             self._repeater = Repeater(self, values["repeat_period"], reader, self._on_silence)
         self._commands = quality.publisher(self, Float64, "controller_command", quality.COMMAND)
-        following = Following(self, reader, self._on_measurement)
-        measurement = following.subscription
-        self.create_timer(_LOOK_EVERY, following.look, clock=STEADY)
+        self._measurements = Following(self, reader, self._on_measurement)
+        measurement = self._measurements.subscription
+        self.create_timer(_LOOK_EVERY, self._look, clock=STEADY)
         if self._remote is None:
             self.create_subscription(Float64, "setpoint", self._on_setpoint, quality.COMMAND)
         if self._reported is None:
@@ -239,6 +239,10 @@ class ControllerNode(ServedNode):
             f"measurements come on {self.resolve_topic_name('measurement')}, "
             f"set-points on {self.resolve_topic_name('setpoint')}"
         )
+
+    def _look(self) -> None:
+        self._measurements.look()
+        self._verifier.look()
 
     # The loop.
 

@@ -31,7 +31,7 @@ from relay_autotune.experiment.settling import rest_state, slow_movement
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.goals import Narrator, conclude, serve_goals
-from relay_autotune.nodes.lifetime import STEADY, ServedNode
+from relay_autotune.nodes.lifetime import ServedNode
 from relay_autotune.nodes.results import keep
 from relay_autotune.nodes.watch import LEAST_SILENCE, SILENT_INTERVALS
 from relay_autotune.process.transfer_function import TransferFunction
@@ -51,7 +51,6 @@ _SLOW_NOISE = 4.0
 # is longer.
 _SILENCE = 2.0
 _SILENT_INTERVALS = 20.0
-_LOOK_EVERY = 0.2
 # This many samples in a row beyond the limit are no outliers of the sensor.
 _IN_A_ROW = 2
 # A gap in the samples of this part of a step leaves too little to judge.
@@ -290,7 +289,6 @@ class Verifier:
         # On the steady clock: the deadline, and the last advance of the samples' time.
         self._until = self._advanced = 0.0
         self._beyond = 0
-        self._watch = node.create_timer(_LOOK_EVERY, self._look, clock=STEADY, autostart=False)
         self._narrator = Narrator(node, self._words, self._tell)
         self._full = quality.publisher(
             node, Verification, "verification", quality.latched(_STEPS_KEPT)
@@ -324,7 +322,6 @@ class Verifier:
         self._waits_for, self._is_settling = "", False
         self.commands.begin()
         self._until = time.monotonic() + _PREPARED_WITHIN + patience
-        self._watch.reset()
         self._node.defer(self._narrator.now)
         self._node.executor.create_task(self._prove, goal)
 
@@ -348,7 +345,6 @@ class Verifier:
             became = await self._ended(passed)
         except Exception as error:  # noqa: BLE001
             became = f"; {_why(error)}"
-        self._watch.cancel()
         self._goal = None
         result = _result(passed, why, f"{why}{became}", self._found)
         self._node.get_logger().info(f"verification {how_ended(result)}")
@@ -613,7 +609,8 @@ class Verifier:
         """End the verification without a verdict."""
         self._end(None, why)
 
-    def _look(self) -> None:
+    def look(self) -> None:
+        """End a proof that takes too long, or whose loop is silent; to be called often."""
         self._wake_up()
         now = time.monotonic()
         if now > self._until:
