@@ -33,14 +33,12 @@ from relay_autotune.experiment.faults import (
 )
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.phases import (
-    Ended,
     Facts,
     Kick,
     Probe,
     Run,
     Settle,
     State,
-    failed,
 )
 from relay_autotune.experiment.relay_law import Levels
 from relay_autotune.experiment.switching import Switching
@@ -57,6 +55,14 @@ counted [s], inf: max_duration alone limits it; ``where`` is the state as the en
 ``answer`` takes the last sample, its time without gaps [s] and the measurement [y]; ``status``
 says what it waits for and sees, after the same sample.
 """
+
+# How an experiment ends by its reason; for any other it has failed.
+_ENDS = {
+    Code.OUTSIDE_LIMITS: State.ABORTED,
+    Code.TOO_FAR: State.ABORTED,
+    Code.CYCLES_AGREE: State.COMPLETED,
+    Code.MAX_CYCLES: State.COMPLETED,
+}
 
 _PHASES: Mapping[State, Callable[[Run], Phase]] = {
     State.KICK: Kick,
@@ -334,7 +340,7 @@ class RelayExperiment:
         if self.finished:
             return self.after_end(measurement)
         if (problem := trace.take(time, measurement)) is not None:
-            return self._end(failed(problem), math.nan)
+            return self._end(State.FAILED, problem, math.nan)
         t, y = trace.time[-1], trace.measurement[-1]
         end = self._passes_limit(t, y) or self._is_dead(t, y, repeated=repeated)
         found = end or self._phase.answer(trace.seen[-1], y)
@@ -342,8 +348,8 @@ class RelayExperiment:
             self.state = found
             self._phase = _PHASES[found](self._run)
             found = self._phase.command
-        if isinstance(found, Ended):
-            command = self._end(found, y)
+        if isinstance(found, Reason):
+            command = self._end(_ENDS.get(found.code, State.FAILED), found, y)
         elif self.parameters.command_rate > 0.0:
             command = self._rate_limited(found)
         else:
@@ -374,7 +380,7 @@ class RelayExperiment:
                 raise ParameterError(
                     "an experiment cannot be completed before its first half cycle; abort it"
                 )
-            self._end(Ended(State.COMPLETED, _reason(reason)), math.nan)
+            self._end(State.COMPLETED, _reason(reason), math.nan)
         return self.after_end(self._last_measurement())
 
     def abort(self, reason: Reason | str, time: float | None = None) -> float:
@@ -387,15 +393,15 @@ class RelayExperiment:
         if not self.finished:
             at = self.elapsed if time is None or not self._trace else time - self._trace.origin
             why = _reason(reason).plus(ended_at=at, where=self._phase.where)
-            self._end(Ended(State.ABORTED, why), math.nan)
+            self._end(State.ABORTED, why, math.nan)
         return self.after_end(self._last_measurement())
 
     def _last_measurement(self) -> float:
         return self._trace.measurement[-1] if self._trace else math.nan
 
-    def _end(self, end: Ended, measurement: float) -> float:
+    def _end(self, state: State, why: Reason, measurement: float) -> float:
         """End the experiment; return the command that answers a measurement [u]."""
-        self.state, self._why = end.state, end.why
+        self.state, self._why = state, why
         if self._policy.hold and not self._policy.give_back:
             self._hold = proportional_hold(self.settings, self.cycles, self._policy.gain)
         return self.after_end(measurement)
@@ -417,36 +423,33 @@ class RelayExperiment:
 
     # The watches of every state.
 
-    def _passes_limit(self, t: float, y: float) -> Ended | None:
-        """Return the end of the experiment if the last sample passes a limit."""
+    def _passes_limit(self, t: float, y: float) -> Reason | None:
+        """Return a reason to end if the last sample passes a limit."""
         p = self.parameters
         low, high = p.measurement_min, p.measurement_max
         if not low <= y <= high:
-            why = Code.OUTSIDE_LIMITS(value=y, time=t, low=low, high=high, **self._moved_by)
-            return Ended(State.ABORTED, why)
+            return Code.OUTSIDE_LIMITS(value=y, time=t, low=low, high=high, **self._moved_by)
         if p.max_deviation > 0.0 and (away := abs(y - self.facts.setpoint)) > p.max_deviation:
-            why = Code.TOO_FAR(value=y, time=t, away=away, most=p.max_deviation, **self._moved_by)
-            return Ended(State.ABORTED, why)
+            most = p.max_deviation
+            return Code.TOO_FAR(value=y, time=t, away=away, most=most, **self._moved_by)
         if 0.0 < p.max_duration < t:
-            return failed(Code.MAX_DURATION(limit=p.max_duration, where=self._phase.where))
+            return Code.MAX_DURATION(limit=p.max_duration, where=self._phase.where)
         if (seen := self._trace.seen[-1]) > self._phase.latest:
-            return failed(Code.TOO_LONG(time=seen, where=self._phase.where))
+            return Code.TOO_LONG(time=seen, where=self._phase.where)
         return None
 
-    def _is_dead(self, t: float, y: float, *, repeated: bool) -> Ended | None:
-        """Return the end of the experiment if the sensor is silent or frozen."""
+    def _is_dead(self, t: float, y: float, *, repeated: bool) -> Reason | None:
+        """Return a reason to end if the sensor is silent or frozen."""
         if repeated:
             longest = max((cycle.period for cycle in self.cycles), default=math.inf)
             if not self._silence.repeat(t, longest_cycle=longest):
                 return None
-            silence, where = self._silence.silence, self._phase.where
-            return failed(Code.SILENT_TOO_LONG(silence=silence, where=where))
+            return Code.SILENT_TOO_LONG(silence=self._silence.silence, where=self._phase.where)
         self._silence.hear(t, relaying=self.state is State.RELAY)
         resting = self.state is State.SETTLING
         if not self._frozen.add(y, at_rest=resting, in_cycles=bool(self.cycles)):
             return None
-        run, where = self._frozen.run, self._phase.where
-        return failed(Code.FROZEN_SENSOR(samples=run, value=y, where=where))
+        return Code.FROZEN_SENSOR(samples=self._frozen.run, value=y, where=self._phase.where)
 
 
 def _reason(reason: Reason | str) -> Reason:

@@ -209,25 +209,8 @@ class Run:
         return not self.levels.from_small or len(self.cycles) >= TRIED
 
 
-@dataclass(frozen=True)
-class Ended:
-    """The experiment has ended.
-
-    :param state: COMPLETED, ABORTED or FAILED.
-    :param why: the reason.
-    """
-
-    state: State
-    why: Reason
-
-
-Answer = float | State | Ended
-"""What a state makes of a sample: a command [u], the state after it, or the end."""
-
-
-def failed(why: Reason) -> Ended:
-    """Return the end of an experiment that has failed."""
-    return Ended(State.FAILED, why)
+Answer = float | State | Reason
+"""What a state makes of a sample: a command [u], the state after it, or why all ends."""
 
 
 SETTLING_LIMIT = 600.0
@@ -301,7 +284,7 @@ class Settle:
         baseline = run.baseline
         if self._watch is not None and self._watch.leaves(y):
             rest = self._watch.rested_at
-            return failed(Code.NOT_AT_BASELINE(rest=rest, value=y, time=t, baseline=baseline))
+            return Code.NOT_AT_BASELINE(rest=rest, value=y, time=t, baseline=baseline)
         if p.settle_time > 0.0:
             if t < p.settle_time or n < _LEAST_SETTLING_SAMPLES:
                 return baseline
@@ -317,7 +300,7 @@ class Settle:
         if settled and (self._watch is None or n >= NOISE_SAMPLES):
             return self._settled(found)
         if t > SETTLING_LIMIT and n >= SETTLING_SAMPLES and not p.max_duration:
-            return failed(Code.NOT_STEADY(time=t, motion=str(found)))
+            return Code.NOT_STEADY(time=t, motion=str(found))
         return baseline
 
     def _settled(self, rest: RestState) -> State:
@@ -402,9 +385,8 @@ class Kick:
             return self.command
         rest, band = facts.rest.mean, detector.band
         stayed = {"band": band, "rest": rest} if band else {"still": rest}
-        return failed(
-            Code.NO_RESPONSE(level=self.command, baseline=self._run.baseline, time=since, **stayed)
-        )
+        baseline = self._run.baseline
+        return Code.NO_RESPONSE(level=self.command, baseline=baseline, time=since, **stayed)
 
     def status(self, t: float, y: float) -> str:
         """Say what it waits for and sees."""

@@ -23,7 +23,7 @@ from relay_autotune.experiment.faults import (
     why_no_return,
     why_noise_alone,
 )
-from relay_autotune.experiment.phases import Answer, Ended, Run, State, failed, kick_limit
+from relay_autotune.experiment.phases import Answer, Run, kick_limit
 from relay_autotune.experiment.relay_law import (
     MOST_COMPENSATED,
     DwellFilter,
@@ -232,7 +232,7 @@ class Switching:
                 return end
         elif self._runs_away(t, y):
             over = self._is_doubtful and not self._run.cycles
-            if end := self._on_timeout(t, y) if over else failed(self._why_lost(t, y)):
+            if end := self._on_timeout(t, y) if over else self._why_lost(t, y):
                 return end
         # The course may have begun anew.
         course = self._course
@@ -291,7 +291,7 @@ class Switching:
         self._limit = p.max_half_cycle or limit + 2.0 * p.extra_delay
         self._longest_limit = max(self._longest_limit, self._limit)
 
-    def _switched(self, t: float) -> Ended | None:
+    def _switched(self, t: float) -> Reason | None:
         """Take a switch of the relay."""
         course, relay, run = self._course, self._course.relay, self._run
         run.switches += 1
@@ -306,7 +306,7 @@ class Switching:
             counts=relay.switches > 1 and not was_shifted,
         )
         self._learn(0.0 if was_shifted else relay.last_stay)
-        end: Ended | None = None
+        end: Reason | None = None
         if begins := relay.is_high and course.answers:
             course.stays.begin(t)
         elif course.stays.is_overdue(t, run.trace.interval):
@@ -317,22 +317,22 @@ class Switching:
         # The course may have begun anew.
         course, known = self._course, run.levels.amplitude <= self._kick_amplitude
         fast = course.fast.stay(course.relay.last_stay, run.facts.response_time, known=known)
-        return end or (failed(fast) if fast else None)
+        return end or fast
 
-    def _learn_anew(self) -> Ended | None:
+    def _learn_anew(self) -> Reason | None:
         """Learn the length of a stay again from the relay's present switching, or fail."""
         course, most = self._course, self._run.parameters.max_cycles
         course.usual = course.usual or usual_period(self._run.cycles)
         if fast := self._too_fast(2.0 * course.stays.longest, course.usual):
-            return failed(fast)
+            return fast
         if len(self._run.cycles) + course.stays.lost >= most:
             lost = course.stays.lost_for
-            return failed(Code.NO_CLEAR_CYCLE(time=lost, cycles=len(self._run.cycles), most=most))
+            return Code.NO_CLEAR_CYCLE(time=lost, cycles=len(self._run.cycles), most=most)
         course.longest = course.stays.longest
         course.is_lost = True
         return None
 
-    def _look_for_noise(self) -> Ended | None:
+    def _look_for_noise(self) -> Reason | None:
         """Make the amplitude larger, or fail, if the last stays did not move the measurement."""
         at = self._course.switched_at
         first, last = at[0], at[-1]
@@ -346,7 +346,7 @@ class Switching:
         if noise is None:
             return None
         if not self._run.levels.can_grow:
-            return failed(noise)
+            return noise
         self._run.levels.grow()
         self._begin()
         return None
@@ -374,7 +374,7 @@ class Switching:
             return False
         return self._has_moved() and rest_state(time - time[0], measurement, len(time)).is_steady
 
-    def _on_timeout(self, t: float, y: float) -> Ended | None:
+    def _on_timeout(self, t: float, y: float) -> Reason | None:
         """Fail, unless the amplitude can grow or a doubtful sign can be reversed."""
         levels, load, course = self._run.levels, self._load, self._course
         # A half cycle beyond the noise shows that the process follows the relay both ways.
@@ -400,7 +400,7 @@ class Switching:
             if self.command != before:
                 load.pushed(t, self._limit)
                 return None
-        return failed(self._why_lost(t, y))
+        return self._why_lost(t, y)
 
     def _has_moved(self) -> bool:
         """Return True unless the measurement stands still since the command last changed."""
@@ -432,7 +432,7 @@ class Switching:
 
     # Cycles.
 
-    def _begin_cycle(self) -> Ended | None:
+    def _begin_cycle(self) -> Reason | None:
         """Take the begin of a cycle, which ends the one before."""
         course, run, p = self._course, self._run, self._run.parameters
         run.cycle_start += (len(run.trace) - 1,)
@@ -442,7 +442,7 @@ class Switching:
         grown, clipped = self._has_grown()
         if clipped or grown:
             course.fast.forget_cycle(run.switches)
-            return failed(clipped) if clipped else None
+            return clipped
         cycle = self._cycle_that_ended()
         was_lost, course.is_lost = course.is_lost, False
         if was_lost:
@@ -450,7 +450,7 @@ class Switching:
         run.cycles += (cycle,)
         for watch in _OF_CYCLES:
             if why := watch(self):
-                return failed(why)
+                return why
         n = len(run.cycles)
         agreed: dict[str, Value] = {"percent": 100.0 * p.cycle_tolerance}
         if run.until_converged and cycle.converged:
@@ -560,21 +560,21 @@ class Switching:
         measurement = run.trace.columns(first, last)[1]
         return why_noise_alone(measurement, run.facts.rest.noise_std, len(run.cycles))
 
-    def _complete(self, why: Reason) -> Ended:
+    def _complete(self, why: Reason) -> Reason:
         """Complete, unless the last cycles may be noise alone."""
         run, levels = self._run, self._run.levels
         if noise := self._only_noise(1):
-            return failed(noise)
+            return noise
         if levels.from_small and not levels.grew_enough:
             reach: dict[str, Value] = {"low": levels.low, "high": levels.high}
             swing, clear, _ = self._last_swing()
             # A quarter of this swing would have stood clear of the noise.
             if not run.cycles[-1].converged or swing.half > _CLEARLY * clear:
-                return failed(Code.REACH_UNKNOWN(**reach, **why.values))
+                return Code.REACH_UNKNOWN(**reach, **why.values)
             run.notes.append(Code.NOTE_REACH(**reach))
         if disturbed := sum(cycle.disturbed for cycle in run.cycles):
             run.notes.append(Code.NOTE_DISTURBED(disturbed=disturbed, cycles=len(run.cycles)))
-        return Ended(State.COMPLETED, why)
+        return why
 
 
 _OF_CYCLES: tuple[Callable[[Switching], Reason | None], ...] = (
