@@ -42,10 +42,8 @@ from relay_autotune.nodes.gains_keeper import GainsJournal, GainsKeeper
 from relay_autotune.nodes.gains_place import (
     OwnGains,
     Place,
-    RemoteGains,
-    RemoteLoop,
+    RemoteController,
     controller_text,
-    mapping_of,
     setpoint_message,
 )
 from relay_autotune.nodes.goals import serve
@@ -173,15 +171,12 @@ class ControllerNode(ServedNode):
             ended=lambda passed: self._keeper.end_verification(passed),
             silent=self._why_silent,
         )
-        self._remote: RemoteLoop | None = None
-        self._place: Place = OwnGains(self._use, self._rate)
+        self._remote: RemoteController | None = None
         setpoints, self._reported = setpoint_message(values), command_reader(values)
         if values["apply_to"]:
-            target, mapping = values["apply_to"], mapping_of(values["apply_parameters"])
-            self._place = RemoteGains(self, target, mapping, values["apply_feedforward"])
-            self._remote = RemoteLoop(
-                self, target, self._setpoint, setpoints, self._verifier.interrupt
-            )
+            interrupt = self._verifier.interrupt
+            self._remote = RemoteController(self, values, setpoints, interrupt)
+        self._place: Place = self._remote or OwnGains(self._use, self._rate)
         reader = reader_of(values["measurement_type"], values["measurement_field"])
         self._value, self._stamp = reader.value, reader.stamp_ns
         self._repeater: Repeater | None = None

@@ -220,26 +220,42 @@ def controller_text(gains: Controller | None) -> str:
     return f"kc {gains.kc:.6g}, ti {gains.ti:.6g} s, td {gains.td:.6g} s"
 
 
-class RemoteGains(_Place):
-    """The parameters of another node.
+class RemoteController(_Place):
+    """Another node that controls: gains are parameters of it, and its set-point is a topic.
 
     Each service call is given up after `TIMEOUT`, because the other node may hang.
 
-    :param node: the calling node.
-    :param target: name of the controlling node.
-    :param mapping: its parameter name for each gain.
-    :param feedforward: its gain from the set-point to the command, added to these [u/y].
+    :param node: this node.
+    :param values: the parameters of controller_node.
+    :param setpoints: writes a set-point into its message.
+    :param disturbed: called with the reason when a third node moves the set-point.
     """
 
     outlives = True
 
     def __init__(
-        self, node: Node, target: str, mapping: Mapping[str, str], feedforward: float
+        self,
+        node: Node,
+        values: Mapping[str, Any],
+        setpoints: CommandMessage,
+        disturbed: Callable[[Reason], None],
     ) -> None:
         # Its law is known with the first gains that are for it.
-        super().__init__(target, mapping, None)
-        self._node, self._feedforward = node, feedforward
-        base = target.rstrip("/")
+        super().__init__(values["apply_to"], mapping_of(values["apply_parameters"]), None)
+        self._node = node
+        # Its gain from the set-point to the command, added to that of its gains [u/y].
+        self._feedforward: float = values["apply_feedforward"]
+        self.command = math.nan
+        """The last command received [u]; NaN before the first."""
+        self.setpoint: float = values["initial_setpoint"]
+        """The set-point in force [y]; NaN: not known."""
+        self._setpoints, self._disturbed = setpoints, disturbed
+        self._offset = 0.0
+        # Own set-points that have not come back yet over the topic, where others may publish, too.
+        self._on_the_way: list[float] = []
+        self._publisher = quality.publisher(node, setpoints.kind, "setpoint", quality.COMMAND)
+        quality.subscription(node, setpoints.kind, "setpoint", self._on_setpoint, quality.COMMAND)
+        base = self.name.rstrip("/")
         # Answers must be handled while the callback that waits for them is still running.
         self._group = ReentrantCallbackGroup()
         self._get, self._set = (
@@ -314,72 +330,14 @@ class RemoteGains(_Place):
         finally:
             self._node.destroy_timer(timer)
 
-
-Place = OwnGains | RemoteGains
-"""Where gains act.
-
-``require_law`` refuses gains for a law that does not run there; ``read`` returns those in force if
-another node may have changed them, else None; ``put`` applies gains, all or none; ``sentence``
-tells which are in force. All but the last raise RelayAutotuneError.
-"""
-
-
-def setpoint_message(values: Mapping[str, Any]) -> CommandMessage:
-    """Return what writes a set-point into the message that its receiver takes.
-
-    :param values: the parameters of controller_node.
-    :raises ParameterError: if nothing is done with a parameter.
-    """
-    field, target = values["controller_command_field"], values["apply_to"]
-    if field and target:
-        return CommandMessage(*(values[each.name] for each in MESSAGE_PARAMETERS))
-    said = [each.name for each in MESSAGE_PARAMETERS if values[each.name] != each.default]
-    if field or said:
-        raise ParameterError(
-            f"{'controller_command_field' if field else said[0]} is given, which is for apply_to "
-            f"together with controller_command_field: the set-point of another node in a message "
-            f"of its own"
-        )
-    return CommandMessage()
-
-
-class RemoteLoop:
-    """Hear another node's controller, and move its set-point.
-
-    :param node: this node.
-    :param target: name of the other node.
-    :param setpoint: its set-point until one is received [y]; NaN: not known.
-    :param setpoints: writes a set-point into its message.
-    :param disturbed: called with the reason when another node moves the set-point.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        target: str,
-        setpoint: float,
-        setpoints: CommandMessage,
-        disturbed: Callable[[Reason], None],
-    ) -> None:
-        self.command = math.nan
-        """The last command received [u]; NaN before the first."""
-        self._target = target
-        self.setpoint = setpoint
-        """The set-point in force [y]; NaN: not known."""
-        self._setpoints = setpoints
-        self._disturbed = disturbed
-        self._offset = 0.0
-        # Own set-points that have not come back yet over the topic, where others may publish, too.
-        self._on_the_way: list[float] = []
-        self._publisher = quality.publisher(node, setpoints.kind, "setpoint", quality.COMMAND)
-        quality.subscription(node, setpoints.kind, "setpoint", self._on_setpoint, quality.COMMAND)
+    # Its loop.
 
     def require_ready(self) -> None:
         """Refuse a loop in which the effect of a set-point step could not be seen.
 
         :raises NotReadyError: with the reason.
         """
-        topic, target = self._publisher.topic_name, self._target
+        topic, target = self._publisher.topic_name, self.name
         if math.isnan(self.setpoint):
             raise NotReadyError(
                 f"the set-point of {target} is not known: publish it on {topic}, or give "
@@ -425,3 +383,31 @@ class RemoteLoop:
         if changed:
             why = f"another node set the set-point to {value:g}"
             self._disturbed(Code.INTERFERED(sentence=why))
+
+
+Place = OwnGains | RemoteController
+"""Where gains act.
+
+``require_law`` refuses gains for a law that does not run there; ``read`` returns those in force if
+another node may have changed them, else None; ``put`` applies gains, all or none; ``sentence``
+tells which are in force. All but the last raise RelayAutotuneError.
+"""
+
+
+def setpoint_message(values: Mapping[str, Any]) -> CommandMessage:
+    """Return what writes a set-point into the message that its receiver takes.
+
+    :param values: the parameters of controller_node.
+    :raises ParameterError: if nothing is done with a parameter.
+    """
+    field, target = values["controller_command_field"], values["apply_to"]
+    if field and target:
+        return CommandMessage(*(values[each.name] for each in MESSAGE_PARAMETERS))
+    said = [each.name for each in MESSAGE_PARAMETERS if values[each.name] != each.default]
+    if field or said:
+        raise ParameterError(
+            f"{'controller_command_field' if field else said[0]} is given, which is for apply_to "
+            f"together with controller_command_field: the set-point of another node in a message "
+            f"of its own"
+        )
+    return CommandMessage()

@@ -20,7 +20,8 @@ from relay_autotune.loop.analysis import Loop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.loop.sampled import UNLIMITED
-from relay_autotune.nodes.gains_place import RemoteGains, mapping_of
+from relay_autotune.nodes.gains_place import RemoteController
+from relay_autotune.nodes.live_types import CommandMessage
 from relay_autotune.nodes.results import keep
 from relay_autotune.nodes.verifier import Predictors, Rest, Trial, Verifiable, judged
 from relay_autotune.process.transfer_function import TransferFunction
@@ -60,8 +61,13 @@ def test_gains_without_an_experiment_take_the_newest_model() -> None:
 
 def test_gains_of_another_node_are_predicted_by_its_law_and_its_feed_forward() -> None:
     """A tune told Ms 1.39, and the proof of the same gains by our own law 1.32."""
-    node: Any = SimpleNamespace(create_client=lambda *_, **__: None)
-    place = RemoteGains(node, "/pid", mapping_of("p:p,i:i,d:d"), 0.8)
+    nothing = lambda *_, **__: None  # noqa: E731
+    node: Any = SimpleNamespace(
+        create_client=nothing, create_publisher=nothing, create_subscription=nothing
+    )
+    values = {"apply_to": "/pid", "apply_parameters": "p:p,i:i,d:d", "apply_feedforward": 0.8}
+    values["initial_setpoint"] = math.nan
+    place = RemoteController(node, values, CommandMessage(), nothing)
     gains = Controller(0.5, 0.6, 0.1)
     assert place.control(gains).rate is None
     designed: Any = SimpleNamespace(law="control_toolbox_legacy", law_period=0.01)
