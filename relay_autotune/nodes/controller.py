@@ -52,7 +52,7 @@ from relay_autotune.nodes.live_types import command_reader, reader_of
 from relay_autotune.nodes.parameters import ask_before_changes, declare, merged, values_of
 from relay_autotune.nodes.results import ResultCheck
 from relay_autotune.nodes.verifier import Predictors, Verifiable, Verifier
-from relay_autotune.nodes.watch import Following, Repeater, require_own_time
+from relay_autotune.nodes.watch import Sensor, require_own_time
 from relay_autotune.reasons import Code, Reason
 from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import PidGains, RelayExperiment
@@ -179,12 +179,9 @@ class ControllerNode(ServedNode):
         self._place: Place = self._remote or OwnGains(self._use, self._rate)
         reader = reader_of(values["measurement_type"], values["measurement_field"])
         self._value, self._stamp = reader.value, reader.stamp_ns
-        self._repeater: Repeater | None = None
-        if values["repeat_period"] > 0.0:
-            self._repeater = Repeater(self, values["repeat_period"], reader, self._on_silence)
         self._commands = quality.publisher(self, Float64, "controller_command", quality.COMMAND)
-        self._measurements = Following(self, reader, self._on_measurement)
-        measurement = self._measurements.subscription
+        self._sensor = Sensor(self, reader, self._on_measurement, self._on_silence)
+        measurement = self._sensor.subscription
         self.create_timer(_LOOK_EVERY, self._look, clock=STEADY)
         if self._remote is None:
             self.create_subscription(Float64, "setpoint", self._on_setpoint, quality.COMMAND)
@@ -236,7 +233,7 @@ class ControllerNode(ServedNode):
         )
 
     def _look(self) -> None:
-        self._measurements.look()
+        self._sensor.look()
         self._verifier.look()
 
     # The loop.
@@ -250,13 +247,13 @@ class ControllerNode(ServedNode):
                 throttle_duration_sec=5.0,
             )
             value = math.nan
-        if self._repeater is not None:
-            self._repeater.hear(value)
+        if (hear := self._sensor.hear) is not None:
+            hear(value)
             self._is_alive(None)
         if self._period > 0.0:
             at = self._count * self._period
             self._count += 1
-        elif self._simulated or self._repeater is not None:
+        elif self._simulated or hear is not None:
             # A repeated value has no stamp of its own.
             at = self.get_clock().now().nanoseconds * 1e-9
         elif self._stamp is not None:
@@ -276,9 +273,8 @@ class ControllerNode(ServedNode):
 
     def _on_silence(self, value: float, ago: float) -> None:
         """Take the last measurement again: a silent sensor means that it has not changed."""
-        assert self._repeater is not None
         # A dead sensor must not be repeated: the integral would run away on an old value.
-        if self._is_alive(self._repeater.why_dead()):
+        if self._is_alive(self._sensor.why_dead()):
             self._take(self.get_clock().now().nanoseconds * 1e-9 - ago, value)
 
     def _is_alive(self, why_dead: Reason | None) -> bool:

@@ -19,14 +19,13 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
-from rclpy.subscription import Subscription
 from std_msgs.msg import Bool, Float64
 
 from relay_autotune.errors import FieldError, NotReadyError
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.nodes import quality, watch
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
-from relay_autotune.nodes.live_types import CommandMessage, Reader
+from relay_autotune.nodes.live_types import CommandMessage
 from relay_autotune.nodes.results import SIGNS_OF_LIFE
 from relay_autotune.reasons import Code, Reason
 from relay_autotune_msgs.msg import PidGains, RelayCycle, TransferFunction
@@ -82,9 +81,8 @@ class RelayTopics:
 
     :param node: the node.
     :param fixed: its fixed parameters by name.
-    :param reader: how the measurement is read from its messages.
+    :param sensor: its measurement.
     :param now_ns: returns the time for the stamps of commands [ns].
-    :param on_measurement: called with each measurement and the middleware's facts about it.
     :param on_result: called with the topic's unresolved name and each model or gains.
     :param on_status: called with each sign of life of the identifier.
     """
@@ -93,10 +91,9 @@ class RelayTopics:
         self,
         node: ServedNode,
         fixed: Mapping[str, Any],
-        reader: Reader,
+        sensor: watch.Sensor,
         now_ns: Callable[[], int],
         *,
-        on_measurement: Callable[[Any, dict[str, Any]], None],
         on_result: Callable[[str, Any], None],
         on_status: Callable[[Any], None],
     ) -> None:
@@ -133,23 +130,17 @@ class RelayTopics:
         self.progress = tells(ExperimentMessage, "relay_progress", quality.RESULT)
         self.experiments = tells(ExperimentMessage, "relay_experiment", quality.RESULT)
         self.diagnostics = tells(DiagnosticArray, "/diagnostics", 1)
-        self.reader = reader
-        self.following = watch.Following(node, reader, on_measurement)
+        self.sensor = sensor
         self.models, self.gains = (
             quality.subscription(node, kind, name, partial(on_result, name), quality.RESULT)
             for kind, name in ((TransferFunction, "transfer_function"), (PidGains, "pi_gains"))
         )
         quality.subscription(node, DiagnosticStatus, SIGNS_OF_LIFE, on_status, quality.RESULT)
 
-    @property
-    def measurement(self) -> Subscription:
-        """The subscription of the measurement that is in force."""
-        return self.following.subscription
-
     def recorded(self) -> dict[str, Any]:
         """Return the publishers and subscriptions to record, by the topics' unresolved names."""
         return {
-            "measurement": self.measurement,
+            "measurement": self.sensor.subscription,
             "command": self.command.publisher,
             "relay_cycle": self.cycles,
             "relay_experiment": self.experiments,
@@ -270,15 +261,12 @@ class LoopSupervisor:
 
     :param node: relay_node.
     :param ends: its topics.
-    :param sensor: its measurement.
     :param stop: ends a running tune; takes the reason.
     """
 
-    def __init__(
-        self, node: Any, ends: RelayTopics, sensor: watch.Sensor, stop: Callable[[Reason], None]
-    ) -> None:
+    def __init__(self, node: Any, ends: RelayTopics, stop: Callable[[Reason], None]) -> None:
         self._node = node
-        self._ends, self._sensor = ends, sensor
+        self._ends, self._sensor = ends, ends.sensor
         self._takeover = takeover = self._value("path") == "takeover"
         self._stop = stop
         self.handover = BumplessTransfer(ends.command.send)
@@ -315,7 +303,7 @@ class LoopSupervisor:
             node.create_timer(0.5 * self.repeat_period, self._send_again, clock=STEADY)
         hears(Float64, "command_feedback", self._on_feedback, often)
         self._watches = (
-            watch.Watch(sensor.problem),
+            watch.Watch(self._sensor.problem),
             watch.Watch(self._several, every=_OF_GRAPH),
             watch.Watch(self._second_commander, every=_OF_GRAPH),
             watch.Watch(lambda: self._overtime.problem()),
@@ -323,7 +311,7 @@ class LoopSupervisor:
             watch.Watch(self._silent_feedback),
             watch.Watch(self._hold_for_silent_controller, in_tune=None),
             # No sample of a tune may be missed.
-            watch.Watch(ends.following.look, in_tune=False, every=_OF_GRAPH),
+            watch.Watch(self._sensor.look, in_tune=False, every=_OF_GRAPH),
         )
         self._looks = 0
         self._timer = node.create_timer(watch.LOOK_EVERY, self._look, clock=STEADY)
@@ -374,7 +362,7 @@ class LoopSupervisor:
 
     def _several(self) -> Reason | None:
         """Return a reason if there is a second sensor, controller or relay_node."""
-        several = watch.second_source(self._node, self._ends.measurement)
+        several = watch.second_source(self._node, self._sensor.subscription)
         if not several and not self._takeover and not self._ends.is_reported:
             several = watch.second_source(self._node, self._controller)
         return several or watch.namesake(self._node)
@@ -460,9 +448,9 @@ class LoopSupervisor:
         silent = self.handover.age
         if not self._was_connected or silent <= self._controller_timeout:
             return None
-        ends = self._ends
-        topic = (ends.measurement if ends.is_reported else self._controller).topic_name
-        return Code.SILENT_CONTROLLER(topic=topic, silence=silent)
+        reported = self._ends.is_reported
+        heard = self._sensor.subscription if reported else self._controller
+        return Code.SILENT_CONTROLLER(topic=heard.topic_name, silence=silent)
 
     def _silent_feedback(self) -> Reason | None:
         silent = time.monotonic() - self._feedback_at

@@ -32,7 +32,7 @@ from relay_autotune.nodes.parameters import merged, values_of
 from relay_autotune.nodes.quality import described, who, why_unconnected
 from relay_autotune.nodes.shell import prefix
 from relay_autotune.nodes.tables import TUNE_PARAMETERS
-from relay_autotune.nodes.watch import LastSamples, Sensor, require_own_time
+from relay_autotune.nodes.watch import LastSamples, require_own_time
 from relay_autotune.reasons import NONE, Code, Reason, reason_of
 from relay_autotune.record.record import Cycle
 from relay_autotune.text import duration
@@ -172,14 +172,11 @@ class Readiness:
 
     :param node: relay_node.
     :param ends: its topics.
-    :param sensor: gives the last measurements, and their age.
     :param loop: the other nodes of the loop.
     """
 
-    def __init__(
-        self, node: Node, ends: RelayTopics, sensor: Sensor, loop: LoopSupervisor
-    ) -> None:
-        self._node, self._ends, self._sensor, self._loop = node, ends, sensor, loop
+    def __init__(self, node: Node, ends: RelayTopics, loop: LoopSupervisor) -> None:
+        self._node, self._ends, self._sensor, self._loop = node, ends, ends.sensor, loop
 
     def of(
         self,
@@ -248,21 +245,19 @@ class Readiness:
 
     def _measured(self) -> str:
         """Say who measures, and how; refuse a start without measurements, as the graph shows."""
-        node, ends, last = self._node, self._ends, self._sensor.samples
+        node, sensor, last = self._node, self._sensor, self._sensor.samples
+        topic, rate = sensor.subscription.topic_name, "rate not known yet"
         if node.get_parameter("use_sim_time").value and node.get_clock().now().nanoseconds == 0:
             raise NotReadyError(Code.NO_CLOCK())
-        if dead := self._sensor.why_dead():
+        if dead := sensor.why_dead():
             raise NotReadyError(dead)
-        if (age := self._sensor.age) > self._sensor.timeout:
-            why = why_unconnected(
-                node, ends.measurement.topic_name, ends.reader.type_name, hears=True
-            )
+        if (age := sensor.age) > sensor.timeout:
+            why = why_unconnected(node, topic, sensor.reader.type_name, hears=True)
             raise NotReadyError(
                 Code.NO_MEASUREMENT_YET(why=why)
                 if math.isinf(age)
                 else Code.NO_MEASUREMENT_NOW(silence=age, why=why)
             )
-        topic, rate = ends.measurement.topic_name, "rate not known yet"
         if last.are_enough:
             rate = f"{1.0 / last.interval:.3g} per second"
         newest = "" if last.newest is None else f", newest {last.newest:.6g} y"

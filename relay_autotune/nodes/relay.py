@@ -70,22 +70,21 @@ class RelayNode(ServedNode):
         self._value = self._reader.value
         require_reported(fixed)
         self._reported = command_reader(fixed)
+        self._sensor = Sensor(self, self._reader, self._on_measurement, self._on_silence)
         self._ends = RelayTopics(
             self,
             fixed,
-            self._reader,
+            self._sensor,
             self._now_ns if self._simulated else time.time_ns,
-            on_measurement=self._on_measurement,
             on_result=self._on_result,
             on_status=lambda status: self._on_status(*said_by(status)),
         )
         self._send, self._relay = self._ends.command.send, self._ends.relay.send
         self._on_setpoint = self._ends.setpoint is not None
-        self._sensor = Sensor(self, self._reader, self._on_silence)
-        self._loop = LoopSupervisor(self, self._ends, self._sensor, self._stop_now)
-        self._readiness = Readiness(self, self._ends, self._sensor, self._loop)
+        self._loop = LoopSupervisor(self, self._ends, self._stop_now)
+        self._readiness = Readiness(self, self._ends, self._loop)
         self._hear = self._sensor.hear
-        self._topic = self._ends.measurement.topic_name
+        self._topic = self._sensor.subscription.topic_name
         self._recordings = Recordings(self, self._ends.recorded)
         self._results = OwnResults(self)
         self._arrival = arrival(self)
@@ -102,7 +101,7 @@ class RelayNode(ServedNode):
         ask_before_changes(self, lambda given: require_settable(self, given, self._running))
         self._name = self.get_fully_qualified_name()
         self.get_logger().info(
-            f"ready: {self._ends.measurement.topic_name} in, {self._ends.command.topic} out; "
+            f"ready: {self._topic} in, {self._ends.command.topic} out; "
             f"start with the service {self._name}/start_tune or the action {self._name}/tune"
         )
 
@@ -423,7 +422,7 @@ class RelayNode(ServedNode):
 
     def _lost(self) -> int:
         # Sequence numbers of several publishers cannot be distinguished.
-        alone = self._ends.measurement.get_publisher_count() <= 1
+        alone = self._sensor.subscription.get_publisher_count() <= 1
         return self._sensor.lost if alone else 0
 
     def hold(self, command: float) -> None:
@@ -440,9 +439,7 @@ class RelayNode(ServedNode):
         if self._sensor.misread:
             problems.append(str(self._sensor.misread))
         elif self._sensor.age > self._sensor.timeout:
-            why = why_unconnected(
-                self, self._ends.measurement.topic_name, self._reader.type_name, hears=True
-            )
+            why = why_unconnected(self, self._topic, self._reader.type_name, hears=True)
             problems.append(f"no measurement comes: {why}")
         problems += filter(None, (self._recordings.problem(), self._loop.problem))
         idle = "passing" if self._loop.is_driven else "idle" if self._held is None else "holding"

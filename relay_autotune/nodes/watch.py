@@ -214,32 +214,52 @@ class LastSamples:
         return rest_state(recent[:, 0] - recent[0, 0], recent[:, 1], len(recent))
 
 
-class Following:
-    """Subscribe to the measurement reliably, and best effort once a publisher offers no more.
+class Sensor:
+    """The measurement: its subscription, its last samples, its losses and its silence.
 
-    A reliable subscription receives nothing from a best effort publisher, and a best effort one
-    would lose samples of a reliable publisher without need. A reliability that the user gives by
-    ``qos_overrides`` stays as it is. The messages have the fast path of the node, unless another
-    callback, that of /clock, tells the time of a sample.
+    The subscription is reliable, and best effort once a publisher offers no more. A reliable one
+    receives nothing from a best effort publisher, and a best effort one would lose samples of a
+    reliable publisher without need. A reliability that the user gives by ``qos_overrides`` stays
+    as it is. The messages have the fast path of the node, unless another callback, that of /clock,
+    tells the time of a sample. With repetition, it is the publisher that shows whether the sensor
+    lives, and not its messages.
 
     :param node: the node.
     :param reader: how the measurement is read from its messages.
     :param take: takes each message and the middleware's facts about it.
+    :param repeat: called as by :class:`Repeater`.
     """
 
     def __init__(
-        self, node: ServedNode, reader: Reader, take: Callable[[Any, dict[str, Any]], None]
+        self,
+        node: ServedNode,
+        reader: Reader,
+        take: Callable[[Any, dict[str, Any]], None],
+        repeat: Callable[[float, float], None],
     ) -> None:
-        self._node, self._reader, self._take = node, reader, take
+        self._node, self.reader, self._take = node, reader, take
         self._favours = not node.get_parameter("use_sim_time").value
         self.subscription = self._subscribed(quality.MEASUREMENT, **quality.OVERRIDABLE)
         """The subscription in force."""
         given = f"qos_overrides.{self.subscription.topic_name}.subscription.reliability"
         self._is_given = given in node._parameter_overrides
+        self.repeat_period = period = float(node.get_parameter("repeat_period").value)
+        """Silence after which a value is repeated [s]; 0: never."""
+        self._repeater = Repeater(node, period, reader, repeat) if period > 0.0 else None
+        self.hear = self._repeater.hear if self._repeater else None
+        """To be called with each measurement; None: no call needed."""
+        self.samples = LastSamples()
+        """The last measurements."""
+        self.misread: Reason | None = None
+        """Why the last message could not be read; None: it could."""
+        self.lost = 0
+        """Samples lost since `begin`, by the publisher's numbers."""
+        self._arrived = -math.inf
+        self._arrivals = self._sequence = 0
 
     def _subscribed(self, profile: QoSProfile, **options: Any) -> Subscription:
         found: Subscription = quality.subscription(
-            self._node, self._reader.kind, "measurement", self._take, profile, **options
+            self._node, self.reader.kind, "measurement", self._take, profile, **options
         )
         if self._favours:
             self._node.favoured = found
@@ -260,7 +280,7 @@ class Following:
         offered = [
             end
             for end in self._node.get_publishers_info_by_topic(name)
-            if end.topic_type == self._reader.type_name
+            if end.topic_type == self.reader.type_name
             and end.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
         ]
         if not offered:
@@ -279,32 +299,6 @@ class Following:
             f"are lost on the way are counted"
         )
 
-
-class Sensor:
-    """Watch the measurement: by its messages, or with repetition by its publisher.
-
-    :param node: the node.
-    :param reader: how the measurement is read from its messages.
-    :param repeat: called as by :class:`Repeater`.
-    """
-
-    def __init__(self, node: Any, reader: Reader, repeat: Callable[[float, float], None]) -> None:
-        self._node = node
-        self.repeat_period = period = float(node.get_parameter("repeat_period").value)
-        """Silence after which a value is repeated [s]; 0: never."""
-        self._repeater = Repeater(node, period, reader, repeat) if period > 0.0 else None
-        self.hear = self._repeater.hear if self._repeater else None
-        """To be called with each measurement; None: no call needed."""
-        self.samples = LastSamples()
-        """The last measurements."""
-        self.misread: Reason | None = None
-        """Why the last message could not be read; None: it could."""
-        self.lost = 0
-        """Samples lost since `begin`, by the publisher's numbers."""
-        self._arrived = -math.inf
-        self._arrivals = self._arrivals_before = 0
-        self._sequence = 0
-
     def count(self, number: int | None) -> None:
         """Take the arrival of a message.
 
@@ -319,8 +313,7 @@ class Sensor:
 
     def arrivals(self) -> int:
         """Return the number of messages since this was last asked."""
-        count = self._arrivals - self._arrivals_before
-        self._arrivals_before = self._arrivals
+        count, self._arrivals = self._arrivals, 0
         return count
 
     @property

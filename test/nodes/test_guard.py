@@ -280,9 +280,13 @@ def test_a_tune_is_asked_for_once_every_other_publisher_must_be_known() -> None:
     ("given", "every", "timeout"), [(0.0, 0.02, 1.0), (0.0, 2.0, 10.0), (1.0, 2.0, 1.0)]
 )
 def test_a_silence_is_measured_by_the_rate_of_the_sensor_unless_it_is_given(given, every, timeout):
-    values = {"repeat_period": 0.0, "measurement_timeout": given}
-    node = SimpleNamespace(get_parameter=lambda name: SimpleNamespace(value=values[name]))
-    sensor = Sensor(node, reader=None, repeat=None)
+    values = {"repeat_period": 0.0, "measurement_timeout": given, "use_sim_time": False}
+    node = SimpleNamespace(
+        get_parameter=lambda name: SimpleNamespace(value=values[name]),
+        create_subscription=lambda *_, **__: SimpleNamespace(topic_name="/level"),
+        _parameter_overrides={},
+    )
+    sensor = Sensor(node, reader=SimpleNamespace(kind=None), take=None, repeat=None)
     sensor.samples = samples_of(every, 30)
     assert sensor.timeout == pytest.approx(timeout)
     # A tune begins with no samples of its own.
