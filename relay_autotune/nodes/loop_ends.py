@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""The ends of relay_node in the graph, and the loop around it.
+"""The commands of relay_node, and the loop around it.
 
 The command of the present controller is passed through, interrupted for a tune, and comes back
 after it.
@@ -12,11 +12,10 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from std_msgs.msg import Bool, Float64
@@ -26,17 +25,12 @@ from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.nodes import quality, watch
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.nodes.live_types import CommandMessage
-from relay_autotune.nodes.results import SIGNS_OF_LIFE
 from relay_autotune.reasons import Code, Reason
-from relay_autotune_msgs.msg import PidGains, RelayCycle, TransferFunction
-from relay_autotune_msgs.msg import RelayExperiment as ExperimentMessage
 
 # Interval and largest number of repeats of the safe command until it is acknowledged.
 # Fast DDS asks for acknowledgements when the publisher's history is full, else every 3 s.
 REPEAT_SAFE = Duration(seconds=0.01)
 REPEATS = 15
-# Number of latched cycles for late subscribers; max_cycles at the node's start if that is more.
-CYCLES_KEPT = 100
 
 
 class CommandPublisher:
@@ -74,91 +68,6 @@ class CommandPublisher:
             self.own.append(self.messages.on_wire(value))
         self._publish(message)
         self.last, self.is_fresh = value, True
-
-
-class RelayTopics:
-    """Publishers and subscriptions of relay_node.
-
-    :param node: the node.
-    :param fixed: its fixed parameters by name.
-    :param sensor: its measurement.
-    :param now_ns: returns the time for the stamps of commands [ns].
-    :param on_result: called with the topic's unresolved name and each model or gains.
-    :param on_status: called with each sign of life of the identifier.
-    """
-
-    def __init__(
-        self,
-        node: ServedNode,
-        fixed: Mapping[str, Any],
-        sensor: watch.Sensor,
-        now_ns: Callable[[], int],
-        *,
-        on_result: Callable[[str, Any], None],
-        on_status: Callable[[Any], None],
-    ) -> None:
-        quality.require_apart(node)
-        commands = CommandMessage(
-            fixed["command_type"],
-            fixed["command_field"],
-            fixed["command_message"],
-            taken=fixed["command_others"] == "other_commands",
-            now_ns=now_ns,
-        )
-        self.is_reported = bool(fixed["controller_command_field"])
-        """True if the controller commands the actuator itself and reports how; the relay then
-        sends nothing but set-points."""
-        # /diagnostics and the answer to a start report an incompatible QoS.
-        self.command = CommandPublisher(
-            node,
-            CommandMessage() if self.is_reported else commands,
-            "command",
-            **quality.OVERRIDABLE,
-        )
-        self.setpoint: CommandPublisher | None = None
-        """Where set-points go out; None: the relay does not move them."""
-        if fixed["relay_on"] == "setpoint":
-            messages = commands if self.is_reported else CommandMessage()
-            self.setpoint = CommandPublisher(node, messages, "setpoint")
-        self.relay = self.setpoint or self.command
-        """Where the relay's levels go out."""
-        self.own = self.relay if self.is_reported else self.command
-        """Where the message goes out that the node was given, and that may have to be repeated."""
-        cycles_kept = max(node.get_parameter("max_cycles").value, CYCLES_KEPT)
-        tells = partial(quality.publisher, node)
-        self.cycles = tells(RelayCycle, "relay_cycle", quality.latched(cycles_kept))
-        self.progress = tells(ExperimentMessage, "relay_progress", quality.RESULT)
-        self.experiments = tells(ExperimentMessage, "relay_experiment", quality.RESULT)
-        self.diagnostics = tells(DiagnosticArray, "/diagnostics", 1)
-        self.sensor = sensor
-        self.models, self.gains = (
-            quality.subscription(node, kind, name, partial(on_result, name), quality.RESULT)
-            for kind, name in ((TransferFunction, "transfer_function"), (PidGains, "pi_gains"))
-        )
-        quality.subscription(node, DiagnosticStatus, SIGNS_OF_LIFE, on_status, quality.RESULT)
-
-    def recorded(self) -> dict[str, Any]:
-        """Return the publishers and subscriptions to record, by the topics' unresolved names."""
-        return {
-            "measurement": self.sensor.subscription,
-            "command": self.command.publisher,
-            "relay_cycle": self.cycles,
-            "relay_experiment": self.experiments,
-            "transfer_function": self.models,
-            "pi_gains": self.gains,
-        }
-
-    def send_until_acknowledged(self, command: float) -> tuple[int, bool]:
-        """Publish the relay's output until every subscriber has acknowledged it.
-
-        :param command: the command [u], or the set-point [y].
-        :return: how often it was published, and whether it was acknowledged.
-        """
-        for count in range(1, REPEATS + 1):
-            self.relay.send(command)
-            if self.relay.publisher.wait_for_all_acked(REPEAT_SAFE):
-                return count, True
-        return REPEATS, False
 
 
 # Number of the controller's last commands that are averaged.
@@ -257,19 +166,45 @@ _OF_GRAPH = 4
 
 
 class LoopSupervisor:
-    """Watch the sensor and the other nodes of the loop, and hand the command over and back.
+    """Command, watch sensor and other nodes of the loop, and hand the command over and back.
 
     :param node: relay_node.
-    :param ends: its topics.
+    :param sensor: its measurement.
+    :param now_ns: returns the time for the stamps of commands [ns].
     :param stop: ends a running tune; takes the reason.
     """
 
-    def __init__(self, node: Any, ends: RelayTopics, stop: Callable[[Reason], None]) -> None:
-        self._node = node
-        self._ends, self._sensor = ends, ends.sensor
+    def __init__(
+        self,
+        node: Any,
+        sensor: watch.Sensor,
+        now_ns: Callable[[], int],
+        stop: Callable[[Reason], None],
+    ) -> None:
+        self._node, self.sensor, self._stop = node, sensor, stop
+        quality.require_apart(node)
+        commands = CommandMessage(
+            *map(self._value, ("command_type", "command_field", "command_message")),
+            taken=self._value("command_others") == "other_commands",
+            now_ns=now_ns,
+        )
+        # True if the controller commands the actuator itself and reports how; the relay then sends
+        # nothing but set-points.
+        self._is_reported = bool(self._value("controller_command_field"))
+        plain = CommandMessage() if self._is_reported else commands
+        # /diagnostics and the answer to a start report an incompatible QoS.
+        self.command = CommandPublisher(node, plain, "command", **quality.OVERRIDABLE)
+        self.setpoint: CommandPublisher | None = None
+        """Where set-points go out; None: the relay does not move them."""
+        if self._value("relay_on") == "setpoint":
+            messages = commands if self._is_reported else CommandMessage()
+            self.setpoint = CommandPublisher(node, messages, "setpoint")
+        self.relay = self.setpoint or self.command
+        """Where the relay's levels go out."""
+        self.own = self.relay if self._is_reported else self.command
+        """Where the message goes out that the node was given, and that may have to be repeated."""
         self._takeover = takeover = self._value("path") == "takeover"
-        self._stop = stop
-        self.handover = BumplessTransfer(ends.command.send)
+        self.handover = BumplessTransfer(self.command.send)
         # The actuator is there already; the controller may be elsewhere.
         self.handover.give_back(self._value("initial_command"), self._value("return_time"))
         self.commanded = math.nan
@@ -285,14 +220,14 @@ class LoopSupervisor:
         self._follow: watch.FollowWatch | None = None
         self._hold = node.create_publisher(Bool, "hold_request", quality.RESULT)
         self._hold.publish(Bool(data=False))
-        self._messages = ends.own.messages
-        self._topic = ends.command.topic
+        self._messages = self.own.messages
+        self._topic = self.command.topic
         kind, often = self._messages.kind, quality.MEASUREMENT
         hears = partial(quality.subscription, node)
         if takeover:
-            self._own = ends.command.own = deque[float](maxlen=_OWN_KEPT)
+            self._sent = self.command.own = deque[float](maxlen=_OWN_KEPT)
             hears(kind, "command", self._on_command, quality.COMMAND)
-        elif not ends.is_reported:
+        elif not self._is_reported:
             self._controller = hears(Float64, "controller_command", self._on_controller, often)
         if self._value("command_others") == "other_commands":
             hears(kind, "other_commands", self._on_others, often)
@@ -303,7 +238,7 @@ class LoopSupervisor:
             node.create_timer(0.5 * self.repeat_period, self._send_again, clock=STEADY)
         hears(Float64, "command_feedback", self._on_feedback, often)
         self._watches = (
-            watch.Watch(self._sensor.problem),
+            watch.Watch(sensor.problem),
             watch.Watch(self._several, every=_OF_GRAPH),
             watch.Watch(self._second_commander, every=_OF_GRAPH),
             watch.Watch(lambda: self._overtime.problem()),
@@ -311,7 +246,7 @@ class LoopSupervisor:
             watch.Watch(self._silent_feedback),
             watch.Watch(self._hold_for_silent_controller, in_tune=None),
             # No sample of a tune may be missed.
-            watch.Watch(self._sensor.look, in_tune=False, every=_OF_GRAPH),
+            watch.Watch(sensor.look, in_tune=False, every=_OF_GRAPH),
         )
         self._looks = 0
         self._timer = node.create_timer(watch.LOOK_EVERY, self._look, clock=STEADY)
@@ -322,13 +257,13 @@ class LoopSupervisor:
     @property
     def _controller_timeout(self) -> float:
         """Longest silence of a present controller [s]; one that answers samples waits for them."""
-        by_rate = watch.SILENT_INTERVALS * self._sensor.samples.interval
+        by_rate = watch.SILENT_INTERVALS * self.sensor.samples.interval
         return max(float(self._value("controller_timeout")), by_rate)
 
     @property
     def is_driven(self) -> bool:
         """True while another node's commands reach the actuator."""
-        tuning = self._experiment is not None and self._ends.setpoint is None
+        tuning = self._experiment is not None and self.setpoint is None
         return self._driven and not tuning
 
     @property
@@ -352,7 +287,7 @@ class LoopSupervisor:
         """
         if several := self._several():
             raise NotReadyError(several)
-        if self._ends.setpoint is not None and not self.is_connected:
+        if self.setpoint is not None and not self.is_connected:
             raise NotReadyError(Code.NO_CONTROLLER())
         if self._takeover and self._driven:
             if self.handover.age <= self._controller_timeout:
@@ -362,8 +297,8 @@ class LoopSupervisor:
 
     def _several(self) -> Reason | None:
         """Return a reason if there is a second sensor, controller or relay_node."""
-        several = watch.second_source(self._node, self._sensor.subscription)
-        if not several and not self._takeover and not self._ends.is_reported:
+        several = watch.second_source(self._node, self.sensor.subscription)
+        if not several and not self._takeover and not self._is_reported:
             several = watch.second_source(self._node, self._controller)
         return several or watch.namesake(self._node)
 
@@ -379,19 +314,19 @@ class LoopSupervisor:
         """
         self._was_connected = self.is_connected
         self._experiment, self._gives_back = experiment, gives_back
-        pause = max(self._sensor.timeout, self._sensor.repeat_period)
+        pause = max(self.sensor.timeout, self.sensor.repeat_period)
         simulated = self._value("use_sim_time")
         self._overtime = watch.Overtime(experiment, pause, simulated=simulated)
-        self._sensor.begin()
+        self.sensor.begin()
         self.commanded = math.nan
-        if self._ends.setpoint is None:
+        if self.setpoint is None:
             self.handover.take_over()
             if not self._node.count_publishers("command_feedback"):
                 # No feedback now is no fault; feedback that starts later is checked from then on.
                 self._feedback_at = math.inf
             timeout = self._value("feedback_timeout")
             self._follow = watch.FollowWatch(self._tolerance(experiment), timeout)
-        self._hold.publish(Bool(data=self._ends.setpoint is None))
+        self._hold.publish(Bool(data=self.setpoint is None))
 
     def _tolerance(self, experiment: RelayExperiment) -> Callable[[], float]:
         """Return the function that gives the largest distance of actuator and command [u]."""
@@ -414,9 +349,21 @@ class LoopSupervisor:
         self._hold.publish(Bool(data=False))
         self._experiment, self._follow = None, None
         period = experiment.cycles[-1].period if experiment.cycle_count else 0.0
-        left = math.nan if self._gives_back or self._ends.setpoint is not None else command
+        left = math.nan if self._gives_back or self.setpoint is not None else command
         self.handover.give_back(left, self._value("return_time") or period)
         self._driven = self._driven and not self._takeover
+
+    def send_until_acknowledged(self, command: float) -> tuple[int, bool]:
+        """Publish the relay's output until every subscriber has acknowledged it.
+
+        :param command: the command [u], or the set-point [y].
+        :return: how often it was published, and whether it was acknowledged.
+        """
+        for count in range(1, REPEATS + 1):
+            self.relay.send(command)
+            if self.relay.publisher.wait_for_all_acked(REPEAT_SAFE):
+                return count, True
+        return REPEATS, False
 
     def leave(self) -> None:
         """Stop passing on a controller's commands; send the safe command if one is given."""
@@ -425,10 +372,10 @@ class LoopSupervisor:
             return
         safe = self._value("safe_command")
         if math.isfinite(safe):
-            self._ends.send_until_acknowledged(safe)
+            self.send_until_acknowledged(safe)
         self._node.get_logger().warning(
             f"nobody passes on what comes on {self._controller.topic_name} any more: the command "
-            f"stays at {self._ends.command.last:g}"
+            f"stays at {self.command.last:g}"
         )
 
     # Callbacks.
@@ -441,15 +388,14 @@ class LoopSupervisor:
             if looks and self._looks % each.every == 0 and (reason := each.problem()):
                 self._stop(reason)
         # A silent sensor is missed at once.
-        left = self._sensor.left if self._experiment is not None else math.inf
+        left = self.sensor.left if self._experiment is not None else math.inf
         watch.again(self._timer, min(watch.LOOK_EVERY, left))
 
     def _silent_controller(self) -> Reason | None:
         silent = self.handover.age
         if not self._was_connected or silent <= self._controller_timeout:
             return None
-        reported = self._ends.is_reported
-        heard = self._sensor.subscription if reported else self._controller
+        heard = self.sensor.subscription if self._is_reported else self._controller
         return Code.SILENT_CONTROLLER(topic=heard.topic_name, silence=silent)
 
     def _silent_feedback(self) -> Reason | None:
@@ -472,7 +418,7 @@ class LoopSupervisor:
         except FieldError as error:
             self._stop(Code.FOREIGN_COMMAND(topic=self._topic, unread=str(error)))
             return
-        if command in self._own:
+        if command in self._sent:
             return
         if self._experiment is not None:
             must = "hold or track"
@@ -489,7 +435,7 @@ class LoopSupervisor:
 
     def _send_again(self) -> None:
         """Send the last command again if none has gone out since the last look."""
-        own = self._ends.own
+        own = self.own
         if own.is_fresh:
             own.is_fresh = False
         elif own.last is not None and not self.is_driven:
@@ -504,7 +450,7 @@ class LoopSupervisor:
             self._stop(Code.NOT_FOLLOWING(**at))
 
     def _hold_for_silent_controller(self) -> None:
-        if self._takeover or self._ends.is_reported or not self.is_driven:
+        if self._takeover or self._is_reported or not self.is_driven:
             return
         timeout = self._controller_timeout
         if self.handover.age <= timeout:

@@ -27,7 +27,7 @@ from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.phases import SMALL_CYCLES, how_long
 from relay_autotune.experiment.relay_law import Levels, clear_swing, sought_swing
 from relay_autotune.nodes.goals import refused
-from relay_autotune.nodes.loop_ends import LoopSupervisor, RelayTopics
+from relay_autotune.nodes.loop_ends import LoopSupervisor
 from relay_autotune.nodes.parameters import merged, values_of
 from relay_autotune.nodes.quality import described, who, why_unconnected
 from relay_autotune.nodes.shell import prefix
@@ -171,12 +171,11 @@ class Readiness:
     """Make the checks before a tune of relay_node.
 
     :param node: relay_node.
-    :param ends: its topics.
-    :param loop: the other nodes of the loop.
+    :param loop: its loop.
     """
 
-    def __init__(self, node: Node, ends: RelayTopics, loop: LoopSupervisor) -> None:
-        self._node, self._ends, self._sensor, self._loop = node, ends, ends.sensor, loop
+    def __init__(self, node: Node, loop: LoopSupervisor) -> None:
+        self._node, self._loop, self._sensor = node, loop, loop.sensor
 
     def of(
         self,
@@ -205,7 +204,7 @@ class Readiness:
         checks.tell("limits", _limits_of(parameters))
         checks.tell("at rest", _rest_of(self._sensor.samples))
         checks.tell("recording", _recording_in(values["record_directory"]))
-        checks.tell("model", _identifier_of(self._node, self._ends.gains.topic_name))
+        checks.tell("model", _identifier_of(self._node))
         checks.tell("expected", *_expected(parameters, self._sensor.samples, last))
         checks.tell("time", self.time_of(ready, parameters))
         return None if checks.refusals else ready
@@ -227,7 +226,7 @@ class Readiness:
         last: tuple[float, Cycle] | None,
     ) -> Ready:
         """Return what a tune would do; raise the reason where that is not possible."""
-        moves_setpoint = self._ends.setpoint is not None
+        moves_setpoint = self._loop.setpoint is not None
         if moves_setpoint:
             # First: the levels are found within the limits of the measurement.
             parameters, baseline = _on_setpoint(parameters)
@@ -266,7 +265,7 @@ class Readiness:
 
     def _commanded(self) -> str:
         """Say who takes the commands; refuse a start if nobody does, or they are not whole."""
-        node, sent = self._node, self._ends.own
+        node, sent = self._node, self._loop.own
         topic, messages = sent.topic, sent.messages
         # In takeover one of the subscriptions is the node's own.
         own = sum(s.topic_name == topic for s in node.subscriptions)
@@ -426,12 +425,12 @@ def _recording_in(directory: str) -> str | Reason:
     return str(room) if free > _LITTLE else room
 
 
-def _identifier_of(node: Node, topic: str) -> str | Reason:
+def _identifier_of(node: Node) -> str | Reason:
     """Say whether model and gains will come.
 
     :param node: the node that tunes.
-    :param topic: resolved name of the gains' topic.
     """
+    topic = node.resolve_topic_name("pi_gains")
     if found := ", ".join(who(end) for end in node.get_publishers_info_by_topic(topic)):
         return f"from {found}"
     there = node.get_namespace()

@@ -21,27 +21,32 @@ from relay_autotune.errors import FieldError, NotReadyError, ParameterError
 from relay_autotune.exchange.messages import finding_from_message, set_stamp
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
+from relay_autotune.nodes import quality
 from relay_autotune.nodes.goals import Narrator, TuneGoal, refused, serve, serve_tunes
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import command_reader, reader_of
-from relay_autotune.nodes.loop_ends import LoopSupervisor, RelayTopics
+from relay_autotune.nodes.loop_ends import LoopSupervisor
 from relay_autotune.nodes.parameters import ask_before_changes, declare, values_of
 from relay_autotune.nodes.quality import NO_REPEAT_AFTER, why_unconnected
 from relay_autotune.nodes.readiness import Checklist, Readiness, Ready, answer_of, require_settable
 from relay_autotune.nodes.recording import Recordings
-from relay_autotune.nodes.results import MODEL, OwnResults, said_by
+from relay_autotune.nodes.results import MODEL, SIGNS_OF_LIFE, OwnResults, said_by
 from relay_autotune.nodes.session import Session, SetpointSession
 from relay_autotune.nodes.tables import FIXED_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.nodes.watch import Sensor, arrival
 from relay_autotune.reasons import Code, Reason
 from relay_autotune.record.record import Cycle, Outcome
 from relay_autotune.text import duration
+from relay_autotune_msgs.msg import PidGains, RelayCycle, TransferFunction
+from relay_autotune_msgs.msg import RelayExperiment as ExperimentMessage
 from relay_autotune_msgs.srv import StartTune
 
 # How long the end of the process waits for the acknowledgement of the record.
 ACKNOWLEDGE = Duration(seconds=0.2)
 # Where a tune that was started by the service is seen.
 WATCH = "the log of {}, or the topic /diagnostics, which tell each second how it goes"
+# Number of latched cycles for late subscribers; max_cycles at the node's start if that is more.
+CYCLES_KEPT = 100
 # Silence of the measurement that is reported during a tune [s].
 SILENT = 0.5
 # How long the end of the process may wait for the last bytes of a recording [s].
@@ -71,21 +76,25 @@ class RelayNode(ServedNode):
         require_reported(fixed)
         self._reported = command_reader(fixed)
         self._sensor = Sensor(self, self._reader, self._on_measurement, self._on_silence)
-        self._ends = RelayTopics(
-            self,
-            fixed,
-            self._sensor,
-            self._now_ns if self._simulated else time.time_ns,
-            on_result=self._on_result,
-            on_status=lambda status: self._on_status(*said_by(status)),
+        now_ns = self._now_ns if self._simulated else time.time_ns
+        self._loop = LoopSupervisor(self, self._sensor, now_ns, self._stop_now)
+        self._send, self._relay = self._loop.command.send, self._loop.relay.send
+        self._on_setpoint = self._loop.setpoint is not None
+        self._readiness = Readiness(self, self._loop)
+        tells, hears = partial(quality.publisher, self), partial(quality.subscription, self)
+        cycles_kept = max(self.get_parameter("max_cycles").value, CYCLES_KEPT)
+        self._cycles = tells(RelayCycle, "relay_cycle", quality.latched(cycles_kept))
+        self._progress = tells(ExperimentMessage, "relay_progress", quality.RESULT)
+        self._experiments = tells(ExperimentMessage, "relay_experiment", quality.RESULT)
+        self._diagnostics = tells(DiagnosticArray, "/diagnostics", 1)
+        self._models, self._gains = (
+            hears(kind, name, partial(self._on_result, name), quality.RESULT)
+            for kind, name in ((TransferFunction, MODEL), (PidGains, "pi_gains"))
         )
-        self._send, self._relay = self._ends.command.send, self._ends.relay.send
-        self._on_setpoint = self._ends.setpoint is not None
-        self._loop = LoopSupervisor(self, self._ends, self._stop_now)
-        self._readiness = Readiness(self, self._ends, self._loop)
+        hears(DiagnosticStatus, SIGNS_OF_LIFE, self._on_status, quality.RESULT)
         self._hear = self._sensor.hear
         self._topic = self._sensor.subscription.topic_name
-        self._recordings = Recordings(self, self._ends.recorded)
+        self._recordings = Recordings(self, self._recorded)
         self._results = OwnResults(self)
         self._arrival = arrival(self)
         # The others of the loop go on while it waits.
@@ -101,7 +110,7 @@ class RelayNode(ServedNode):
         ask_before_changes(self, lambda given: require_settable(self, given, self._running))
         self._name = self.get_fully_qualified_name()
         self.get_logger().info(
-            f"ready: {self._topic} in, {self._ends.command.topic} out; "
+            f"ready: {self._topic} in, {self._loop.command.topic} out; "
             f"start with the service {self._name}/start_tune or the action {self._name}/tune"
         )
 
@@ -202,6 +211,17 @@ class RelayNode(ServedNode):
         reason += f"; watch {WATCH.format(self._name)}"
         return StartTune.Response(accepted=True, reason=reason, experiment_id=identity)
 
+    def _recorded(self) -> dict[str, Any]:
+        """Return the publishers and subscriptions to record, by the topics' unresolved names."""
+        return {
+            "measurement": self._sensor.subscription,
+            "command": self._loop.command.publisher,
+            "relay_cycle": self._cycles,
+            "relay_experiment": self._experiments,
+            "transfer_function": self._models,
+            "pi_gains": self._gains,
+        }
+
     def _refuse(self, why: Reason) -> StartTune.Response:
         self.get_logger().warning(f"start refused: {why}")
         return refused(why)
@@ -253,7 +273,7 @@ class RelayNode(ServedNode):
             self.defer(self._narrator.now)
         if early is not None and early.is_due(experiment):
             early.look(experiment)
-            self.defer(lambda: self._ends.progress.publish(session.message()))
+            self.defer(lambda: self._progress.publish(session.message()))
 
     def _publish_cycle(self, session: Session, index: int) -> None:
         self._tell(session.experiment.status)
@@ -261,7 +281,7 @@ class RelayNode(ServedNode):
             # The controller's commands are known only at the end.
             return
         message = session.cycle_message(index)
-        self._ends.cycles.publish(message)
+        self._cycles.publish(message)
         session.recording.message("relay_cycle", session.now_ns(), message)
 
     def _abort(self, _: Trigger.Request) -> str:
@@ -290,7 +310,7 @@ class RelayNode(ServedNode):
                     tune.goal.note(topic, found)
         if name == MODEL and message.final and not taken:
             # Gains without a model are no result: waiting longer brings nothing.
-            self._on_status(message.experiment_id, False, self._results.refusals.last)
+            self._note_progress(message.experiment_id, False, self._results.refusals.last)
         if running is None or not taken:
             return
         self._tell(running.experiment.status)
@@ -300,7 +320,10 @@ class RelayNode(ServedNode):
             self._send_safe(command := running.experiment.conclude(reason))
             self._leave(running, command)
 
-    def _on_status(self, experiment_id: str, working: bool, text: str) -> None:
+    def _on_status(self, message: Any) -> None:
+        self._note_progress(*said_by(message))
+
+    def _note_progress(self, experiment_id: str, working: bool, text: str) -> None:
         """Take a sign of life of the identifier, as `Recording.note_progress`."""
         if (tune := self._tunes.get(experiment_id)) is not None:
             tune.recording.note_progress(working, text)
@@ -328,7 +351,7 @@ class RelayNode(ServedNode):
         return acknowledged
 
     def _send_safe(self, command: float) -> bool:
-        count, acknowledged = self._ends.send_until_acknowledged(command)
+        count, acknowledged = self._loop.send_until_acknowledged(command)
         if self.get_parameter("sample_period").value > 0.0:
             # A plant in lockstep answers each repeat with a measurement; these need no answer.
             self._ahead = count
@@ -346,7 +369,7 @@ class RelayNode(ServedNode):
     def _complete(self, session: Session) -> None:
         experiment = session.experiment
         message = session.message()
-        self._ends.experiments.publish(message)
+        self._experiments.publish(message)
         outcome = experiment.outcome.name.lower()
         self._summary = f"last tune {session.id} {outcome}: {experiment.reason}"
         completed = experiment.outcome == Outcome.COMPLETED
@@ -391,7 +414,7 @@ class RelayNode(ServedNode):
             elif self._held is not None:
                 self._send_safe(self._held)
             self.work_off()
-            self._ends.experiments.wait_for_all_acked(ACKNOWLEDGE)
+            self._experiments.wait_for_all_acked(ACKNOWLEDGE)
         finally:
             self._recordings.close_all(f"because {reason}", CLOSE_WITHIN)
 
@@ -462,7 +485,7 @@ class RelayNode(ServedNode):
         )
         message = DiagnosticArray(status=[status])
         set_stamp(message.header.stamp, self._now_ns())
-        self._ends.diagnostics.publish(message)
+        self._diagnostics.publish(message)
 
 
 def require_reported(values: Mapping[str, Any]) -> None:
