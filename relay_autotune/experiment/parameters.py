@@ -161,7 +161,22 @@ class ExperimentParameters:
             values expected.
         """
         check(self, ParameterError)
-        self._validate_together()
+        self.validate_but_amplitude()
+        if self.finds_amplitude:
+            limits = ("command_min", "command_max")
+            lacking = [name for name in limits if not math.isfinite(getattr(self, name))]
+            if lacking:
+                raise ParameterError(
+                    "amplitude is 0, to be found within the limits of the command; "
+                    f"{' and '.join(lacking)} not given: give both limits, or the amplitude, half "
+                    "the step that the process may see"
+                )
+        elif abs(self.relay_bias) >= self.amplitude:
+            raise ParameterError(
+                f"bias is {self.bias:g}, expected less than the amplitude {self.amplitude:g} in "
+                f"magnitude: otherwise both levels lie on one side of the baseline and the "
+                f"measurement never comes back"
+            )
         if baseline is not None:
             self._validate_levels(baseline)
 
@@ -192,24 +207,6 @@ class ExperimentParameters:
             raise ParameterError(
                 f"setpoint is {self.setpoint:g}, expected between measurement_min "
                 f"{self.measurement_min:g} and measurement_max {self.measurement_max:g}"
-            )
-
-    def _validate_together(self) -> None:
-        self.validate_but_amplitude()
-        if self.finds_amplitude:
-            limits = ("command_min", "command_max")
-            lacking = [name for name in limits if not math.isfinite(getattr(self, name))]
-            if lacking:
-                raise ParameterError(
-                    "amplitude is 0, to be found within the limits of the command; "
-                    f"{' and '.join(lacking)} not given: give both limits, or the amplitude, half "
-                    "the step that the process may see"
-                )
-        elif abs(self.relay_bias) >= self.amplitude:
-            raise ParameterError(
-                f"bias is {self.bias:g}, expected less than the amplitude {self.amplitude:g} in "
-                f"magnitude: otherwise both levels lie on one side of the baseline and the "
-                f"measurement never comes back"
             )
 
     def _validate_levels(self, baseline: float) -> None:

@@ -433,34 +433,30 @@ class LoadCompensation:
             self._notes.append(note)
 
 
-def clear_swing(noise_std: float, hysteresis: float, measurement: FloatArray) -> float:
+def clear_swing(p: ExperimentParameters, noise_std: float, measurement: FloatArray) -> float:
     """Return the half swing that is clear of noise, hysteresis and resolution [y].
 
+    :param p: the user's parameters.
     :param noise_std: standard deviation of the noise [y].
-    :param hysteresis: half width of the relay's band [y].
     :param measurement: samples of the oscillation [y], shape (n,).
     """
     return max(
         CLEAR_OF_NOISE * noise_std,
-        CLEAR_OF_HYSTERESIS * hysteresis,
+        CLEAR_OF_HYSTERESIS * p.band(noise_std),
         CLEAR_OF_STEPS * resolution(measurement),
     )
 
 
 def sought_swing(
-    p: ExperimentParameters,
-    clear: float,
-    noise_std: float,
-    setpoint: float,
-    measurement: FloatArray,
+    p: ExperimentParameters, noise_std: float, setpoint: float, measurement: FloatArray
 ) -> float:
     """Return the half swing at which an amplitude that is searched for is large enough [y].
 
     :param p: the user's parameters.
-    :param clear: half swing that is clear of noise, hysteresis and resolution [y].
     :param noise_std: standard deviation of the noise [y].
     :param setpoint: about which the relay switches [y].
     :param measurement: samples of the oscillation [y], shape (n,).
     """
     ample = _AMPLE * max(noise_std, resolution(measurement))
+    clear = clear_swing(p, noise_std, measurement)
     return p.target_amplitude or max(clear, min(ample, _OF_ROOM * p.room(setpoint)))

@@ -476,7 +476,7 @@ class Switching:
         if not levels.searching:
             return False, None
         swing, clear, y = self._last_swing()
-        least = sought_swing(run.parameters, clear, facts.rest.noise_std, facts.setpoint, y)
+        least = sought_swing(run.parameters, facts.rest.noise_std, facts.setpoint, y)
         if not levels.from_small and (why := levels.why_clipped(swing, settled=False)):
             return False, why
         levels.note_small(swing, clear)
@@ -494,10 +494,10 @@ class Switching:
 
     def _last_swing(self) -> tuple[Swing, float, FloatArray]:
         """Return the swing of the last cycle, half of the least clear one, and its samples."""
-        run, facts = self._run, self._run.facts
+        run = self._run
         first, last = run.cycle_start[-2:]
         time, y, _ = run.trace.columns(first, last + 1)
-        clear = clear_swing(facts.rest.noise_std, facts.hysteresis, y)
+        clear = clear_swing(run.parameters, run.facts.rest.noise_std, y)
         return Swing(0.5 * float(y.max() - y.min()), float(time[-1] - time[0])), clear, y
 
     def _cycle_that_ended(self) -> Cycle:

@@ -25,7 +25,7 @@ from relay_autotune.experiment.faults import SafePolicy
 from relay_autotune.experiment.parameters import PARAMETERS as EXPERIMENT_PARAMETERS
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.experiment.phases import SMALL_CYCLES, how_long
-from relay_autotune.experiment.relay_law import Levels, clear_swing, sought_swing
+from relay_autotune.experiment.relay_law import Levels, sought_swing
 from relay_autotune.nodes.goals import refused
 from relay_autotune.nodes.loop_ends import LoopSupervisor
 from relay_autotune.nodes.parameters import merged, values_of
@@ -466,9 +466,8 @@ def _expected(
         return text, Mark.OK
     else:
         seen, noise = np.array(samples.before()), rest.noise_std
-        clear = clear_swing(noise, parameters.band(noise), seen)
         setpoint = rest.mean if math.isnan(parameters.setpoint) else parameters.setpoint
-        swing = sought_swing(parameters, clear, noise, setpoint, seen)
+        swing = sought_swing(parameters, noise, setpoint, seen)
         text = f"a swing of at least {swing:.2g} y each way, where the levels stop growing"
         mend = "give wider limits"
     beyond = [f"{end:g}" for end in (low, high) if abs(end - rest.mean) <= swing]
