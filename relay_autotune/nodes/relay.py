@@ -179,8 +179,7 @@ class RelayNode(ServedNode):
             self.destroy_timer(timer)
             command = session.answer_after_all() if session is self._session else None
             if command is not None:
-                self._send(command)
-                session.answered()
+                self._respond(session, command)
 
         timer = self.create_timer(NO_REPEAT_AFTER, answer, clock=STEADY)
 
