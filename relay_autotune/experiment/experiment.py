@@ -339,7 +339,7 @@ class RelayExperiment:
         trace = self._trace
         if self.finished:
             return self.after_end(measurement)
-        if (problem := trace.take(time, measurement)) is not None:
+        if (problem := trace.add(time, measurement)) is not None:
             return self._end(State.FAILED, problem, math.nan)
         t, y = trace.time[-1], trace.measurement[-1]
         end = self._passes_limit(t, y) or self._is_dead(t, y, repeated=repeated)

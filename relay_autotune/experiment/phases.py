@@ -67,7 +67,7 @@ class Samples:
         self._gaps = 0.0
         self._steps = self._repeats = 0
 
-    def take(self, time: float, measurement: float) -> Reason | None:
+    def add(self, time: float, measurement: float) -> Reason | None:
         """Append a sample that is not answered yet, or return why it cannot be used.
 
         :param time: its instant [s], on any axis.
@@ -88,10 +88,10 @@ class Samples:
                 return Code.TIME_REPEATS(samples=_LONGEST_REPEAT, time=t)
         else:
             self._repeats = 0
-        self._add(t, float(measurement))
+        self._append(t, float(measurement))
         return None
 
-    def _add(self, time: float, measurement: float) -> None:
+    def _append(self, time: float, measurement: float) -> None:
         # Several samples at one instant (a clock in steps) count as one interval.
         if self.time and time > self.time[-1]:
             if self._steps < _FIRST:
