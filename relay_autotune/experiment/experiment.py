@@ -130,7 +130,8 @@ class RelayExperiment:
         self._trace = self._run.trace
         self._phase: Phase = Settle(self._run, before)
         self._why = NONE
-        self._policy = policy
+        self.policy = policy
+        """How the process is left at the end."""
         self._hold: Callable[[float], float] | None = None
         self._frozen = FrozenWatch()
         self._silence = SilenceWatch()
@@ -364,7 +365,7 @@ class RelayExperiment:
         """
         if self._hold is not None:
             return self._hold(measurement)
-        if self.state is State.COMPLETED and not self._policy.give_back:
+        if self.state is State.COMPLETED and not self.policy.give_back:
             return self.baseline
         return self.safe_command
 
@@ -402,8 +403,8 @@ class RelayExperiment:
     def _end(self, state: State, why: Reason, measurement: float) -> float:
         """End the experiment; return the command that answers a measurement [u]."""
         self.state, self._why = state, why
-        if self._policy.hold and not self._policy.give_back:
-            self._hold = proportional_hold(self.settings, self.cycles, self._policy.gain)
+        if self.policy.hold and not self.policy.give_back:
+            self._hold = proportional_hold(self.settings, self.cycles, self.policy.gain)
         return self.after_end(measurement)
 
     def _rate_limited(self, wanted: float) -> float:

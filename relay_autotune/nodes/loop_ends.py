@@ -207,12 +207,9 @@ class LoopSupervisor:
         self.handover = BumplessTransfer(self.command.send)
         # The actuator is there already; the controller may be elsewhere.
         self.handover.give_back(self._value("initial_command"), self._value("return_time"))
-        self.commanded = math.nan
-        """The last command of the tune [u]."""
         self._experiment: RelayExperiment | None = None
         self._overtime: watch.Overtime
-        self._gives_back = self._was_connected = False
-        self._driven = False
+        self._was_connected = self._driven = False
         self.problem = ""
         """A problem that an operator must act on, or ""."""
         # Time of the last feedback; inf: there is no feedback.
@@ -306,19 +303,17 @@ class LoopSupervisor:
         """Return a reason if another node commands, which it may in takeover."""
         return None if self._takeover else watch.second_publisher(self._node, self._topic)
 
-    def take(self, experiment: RelayExperiment, *, gives_back: bool) -> None:
+    def take(self, experiment: RelayExperiment) -> None:
         """Take the command for a tune.
 
         :param experiment: the tune.
-        :param gives_back: True if the controller gets the command back at once at any end.
         """
         self._was_connected = self.is_connected
-        self._experiment, self._gives_back = experiment, gives_back
+        self._experiment = experiment
         pause = max(self.sensor.timeout, self.sensor.repeat_period)
         simulated = self._value("use_sim_time")
         self._overtime = watch.Overtime(experiment, pause, simulated=simulated)
         self.sensor.begin()
-        self.commanded = math.nan
         if self.setpoint is None:
             self.handover.take_over()
             if not self._node.count_publishers("command_feedback"):
@@ -349,7 +344,8 @@ class LoopSupervisor:
         self._hold.publish(Bool(data=False))
         self._experiment, self._follow = None, None
         period = experiment.cycles[-1].period if experiment.cycle_count else 0.0
-        left = math.nan if self._gives_back or self.setpoint is not None else command
+        at_once = experiment.policy.give_back or self.setpoint is not None
+        left = math.nan if at_once else command
         self.handover.give_back(left, self._value("return_time") or period)
         self._driven = self._driven and not self._takeover
 
@@ -405,11 +401,11 @@ class LoopSupervisor:
         return Code.SILENT_FEEDBACK(silence=silent)
 
     def _on_controller(self, message: Float64) -> None:
-        passed = self.handover.hear(message.data)
+        passed, tune = self.handover.hear(message.data), self._experiment
         if passed is not None:
             self._driven, self.problem = True, ""
-        elif self._gives_back and self._experiment is not None and self.is_connected:
-            self._experiment.safe_command = self.handover.last
+        elif tune is not None and tune.policy.give_back and self.is_connected:
+            tune.safe_command = self.handover.last
 
     def _on_command(self, message: Any) -> None:
         """Take a message on the command topic, where other nodes may publish, too."""
@@ -443,10 +439,12 @@ class LoopSupervisor:
 
     def _on_feedback(self, message: Float64) -> None:
         self._feedback_at = time.monotonic()
-        if self._follow is None or math.isnan(self.commanded):
+        tune, commanded = self._experiment, self.command.last
+        # The first command of a tune answers its first sample.
+        if self._follow is None or tune is None or not tune.sample_count or commanded is None:
             return
-        if self._follow.add(self._feedback_at, self.commanded, message.data):
-            at = {"command": self.commanded, "position": message.data, **self._follow.rail}
+        if self._follow.add(self._feedback_at, commanded, message.data):
+            at = {"command": commanded, "position": message.data, **self._follow.rail}
             self._stop(Code.NOT_FOLLOWING(**at))
 
     def _hold_for_silent_controller(self) -> None:

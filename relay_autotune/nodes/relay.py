@@ -163,7 +163,6 @@ class RelayNode(ServedNode):
         # Publish first, because the actuator waits for it.
         self._relay(command)
         session.answered()
-        self._loop.commanded = command
         self._defer_news(session)
         if session.experiment.finished:
             self._leave(session, command)
@@ -256,7 +255,7 @@ class RelayNode(ServedNode):
         self._sensor.samples.forget()
         self._alarm = ""
         self._session = self._tunes[identity] = session
-        self._loop.take(session.experiment, gives_back=policy.give_back)
+        self._loop.take(session.experiment)
         self.defer(self._narrator.now)
         return identity, self._recordings.problem() or f"recorded in {recording.path}"
 
