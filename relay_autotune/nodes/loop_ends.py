@@ -52,7 +52,7 @@ class CommandPublisher:
         self.topic: str = self.publisher.topic_name
         # Looked up once, because they are called for each measurement.
         self._written, self._publish = messages.written, self.publisher.publish
-        self.own: deque[float] | None = None
+        self.kept: deque[float] | None = None
         """Gets each number as its receivers read it, before it is published; None: not kept."""
         self.last: float | None = None
         """The number published last; None: there was none."""
@@ -64,8 +64,8 @@ class CommandPublisher:
         message = self._written(value)
         if message is None:
             return
-        if self.own is not None:
-            self.own.append(self.messages.on_wire(value))
+        if self.kept is not None:
+            self.kept.append(self.messages.on_wire(value))
         self._publish(message)
         self.last, self.is_fresh = value, True
 
@@ -203,7 +203,7 @@ class LoopSupervisor:
         """Where the relay's levels go out."""
         self.own = self.relay if self._is_reported else self.command
         """Where the message goes out that the node was given, and that may have to be repeated."""
-        self._takeover = takeover = self._value("path") == "takeover"
+        self._takeover = self._value("path") == "takeover"
         self.handover = BumplessTransfer(self.command.send)
         # The actuator is there already; the controller may be elsewhere.
         self.handover.give_back(self._value("initial_command"), self._value("return_time"))
@@ -221,8 +221,8 @@ class LoopSupervisor:
         self._topic = self.command.topic
         kind, often = self._messages.kind, quality.MEASUREMENT
         hears = partial(quality.subscription, node)
-        if takeover:
-            self._sent = self.command.own = deque[float](maxlen=_OWN_KEPT)
+        if self._takeover:
+            self._sent = self.command.kept = deque[float](maxlen=_OWN_KEPT)
             hears(kind, "command", self._on_command, quality.COMMAND)
         elif not self._is_reported:
             self._controller = hears(Float64, "controller_command", self._on_controller, often)
