@@ -205,8 +205,13 @@ class LoopSupervisor:
         """Where the message goes out that the node was given, and that may have to be repeated."""
         self._takeover = self._value("path") == "takeover"
         self.handover = BumplessTransfer(self.command.send)
+        initial = self._value("initial_command")
         # The actuator is there already; the controller may be elsewhere.
-        self.handover.give_back(self._value("initial_command"), self._value("return_time"))
+        self.handover.give_back(initial, self._value("return_time"))
+        self.held: float | None = None if math.isnan(initial) else initial
+        """The command that is held where nobody else commands [u]; None: none was sent yet."""
+        # Returns it for each measurement; None: it stays.
+        self._after: Callable[[float], float] | None = None
         self._experiment: RelayExperiment | None = None
         self._overtime: watch.Overtime
         self._was_connected = self._driven = False
@@ -348,6 +353,17 @@ class LoopSupervisor:
         left = math.nan if at_once else command
         self.handover.give_back(left, self._value("return_time") or period)
         self._driven = self._driven and not self._takeover
+        if self.setpoint is None:
+            self.held, self._after = command, experiment.after_end
+
+    def answer(self, measurement: float) -> None:
+        """Answer a measurement [y] while no tune runs, unless another node commands."""
+        if self.is_driven:
+            return
+        if self._after is not None:
+            self.held = self._after(measurement)
+        if self.held is not None:
+            self.command.send(self.held)
 
     def send_until_acknowledged(self, command: float) -> tuple[int, bool]:
         """Publish the relay's output until every subscriber has acknowledged it.
@@ -457,7 +473,8 @@ class LoopSupervisor:
         safe = self.handover.mean() if math.isnan(given) else given
         self._driven = False
         # The safe command goes out before the log message.
-        self._node.hold(safe)
+        self.held, self._after = safe, None
+        self.command.send(safe)
         self.handover.give_back(safe, self._value("return_time"))
         self.problem = (
             f"{self._controller.topic_name} has been silent for more than {timeout:g} s; the "

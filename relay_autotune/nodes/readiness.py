@@ -178,17 +178,12 @@ class Readiness:
         self._node, self._loop, self._sensor = node, loop, loop.sensor
 
     def of(
-        self,
-        amplitude: float,
-        checks: Checklist,
-        held: float | None,
-        last: tuple[float, Cycle] | None,
+        self, amplitude: float, checks: Checklist, last: tuple[float, Cycle] | None
     ) -> Ready | None:
         """Make the checks, and return what a tune would do; None where one of them failed.
 
         :param amplitude: half the distance of the two levels [u]; 0: the parameter.
         :param checks: get a line each.
-        :param held: the command that the node holds now [u]; None: it has not sent a command.
         :param last: amplitude of the last tune [u], and its last cycle; None: there is none.
         """
         values = values_of(self._node, TUNE_PARAMETERS)
@@ -196,7 +191,7 @@ class Readiness:
         if amplitude != 0.0:
             chosen["amplitude"] = amplitude
         parameters = ExperimentParameters(**chosen)
-        ready = checks.do("levels", partial(self._planned, values, parameters, held, last))
+        ready = checks.do("levels", partial(self._planned, values, parameters, last))
         checks.do("measurement", self._measured)
         checks.do("command", self._commanded)
         checks.do("alone", partial(self._alone, values["sample_period"]))
@@ -222,7 +217,6 @@ class Readiness:
         self,
         values: Mapping[str, Any],
         parameters: ExperimentParameters,
-        held: float | None,
         last: tuple[float, Cycle] | None,
     ) -> Ready:
         """Return what a tune would do; raise the reason where that is not possible."""
@@ -232,7 +226,8 @@ class Readiness:
             parameters, baseline = _on_setpoint(parameters)
         else:
             parameters.validate()
-            baseline = _baseline_from(values["baseline"], self._loop.mean_command(), held)
+            mean, held = self._loop.mean_command(), self._loop.held
+            baseline = _baseline_from(values["baseline"], mean, held)
         parameters.validate(baseline)
         policy = _policy_from(values, connected=self._loop.is_connected)
         # A feedback of the position, or the controller of a closed loop, also shows where the

@@ -61,9 +61,6 @@ class RelayNode(ServedNode):
         declare(self, TUNE_PARAMETERS)
         declare(self, FIXED_PARAMETERS, read_only=True)
         fixed = values_of(self, FIXED_PARAMETERS)
-        initial = fixed["initial_command"]
-        self._held: float | None = None if math.isnan(initial) else initial
-        self._after: Callable[[float], float] | None = None
         self._session: Session | None = None
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         # Amplitude and last cycle of the last tune.
@@ -78,7 +75,7 @@ class RelayNode(ServedNode):
         self._sensor = Sensor(self, self._reader, self._on_measurement, self._on_silence)
         now_ns = self._now_ns if self._simulated else time.time_ns
         self._loop = LoopSupervisor(self, self._sensor, now_ns, self._stop_now)
-        self._send, self._relay = self._loop.command.send, self._loop.relay.send
+        self._relay = self._loop.relay.send
         self._on_setpoint = self._loop.setpoint is not None
         self._readiness = Readiness(self, self._loop)
         tells, hears = partial(quality.publisher, self), partial(quality.subscription, self)
@@ -140,8 +137,7 @@ class RelayNode(ServedNode):
             elif session.may_be_no_repeat:
                 self._answer_later(session)
         else:
-            if not self._loop.is_driven:
-                self._answer_idle(value)
+            self._loop.answer(value)
             self._sensor.samples.add(value, info["source_timestamp"])
         if self._reported is not None:
             # After the answer: it belongs to this sample, and the one before is still needed.
@@ -156,8 +152,8 @@ class RelayNode(ServedNode):
         """Take the last measurement again: a silent sensor means that it has not changed."""
         if (session := self._session) is not None:
             self._respond(session, session.repeat(value, ago))
-        elif not self._loop.is_driven:
-            self._answer_idle(value)
+        else:
+            self._loop.answer(value)
 
     def _respond(self, session: Session, command: float) -> None:
         # Publish first, because the actuator waits for it.
@@ -166,12 +162,6 @@ class RelayNode(ServedNode):
         self._defer_news(session)
         if session.experiment.finished:
             self._leave(session, command)
-
-    def _answer_idle(self, value: float) -> None:
-        if self._after is not None:
-            self._held = self._after(value)
-        if self._held is not None:
-            self._send(self._held)
 
     def _answer_later(self, session: Session) -> None:
         def answer() -> None:
@@ -196,7 +186,7 @@ class RelayNode(ServedNode):
         if self._session is not None:
             return self._refuse(Code.RUNNING(tune=self._session.id, node=self._name))
         checks = Checklist()
-        ready = self._readiness.of(amplitude, checks, self._held, self._last_cycle)
+        ready = self._readiness.of(amplitude, checks, self._last_cycle)
         if ready is None:
             return answer_of(checks) if dry_run else self._refuse(checks.refusals[0])
         takes = self._readiness.time_of(ready, ready.parameters)
@@ -357,8 +347,6 @@ class RelayNode(ServedNode):
 
     def _leave(self, session: Session, command: float) -> None:
         # The safe command is out. Slow work is deferred until the callback has returned.
-        if not self._on_setpoint:
-            self._held, self._after = command, session.experiment.after_end
         self._session = None
         session.lost_samples = self._lost()
         self._loop.give_back(session.experiment, command)
@@ -409,8 +397,8 @@ class RelayNode(ServedNode):
                 self._stop(session, reason)
             elif self._loop.is_driven:
                 self._loop.leave()
-            elif self._held is not None:
-                self._send_safe(self._held)
+            elif self._loop.held is not None:
+                self._send_safe(self._loop.held)
             self.work_off()
             self._experiments.wait_for_all_acked(ACKNOWLEDGE)
         finally:
@@ -446,11 +434,6 @@ class RelayNode(ServedNode):
         alone = self._sensor.subscription.get_publisher_count() <= 1
         return self._sensor.lost if alone else 0
 
-    def hold(self, command: float) -> None:
-        """Answer each measurement with a command from now on."""
-        self._held, self._after = command, None
-        self._send(command)
-
     def _now_ns(self) -> int:
         return int(self.get_clock().now().nanoseconds)
 
@@ -463,9 +446,9 @@ class RelayNode(ServedNode):
             why = why_unconnected(self, self._topic, self._reader.type_name, hears=True)
             problems.append(f"no measurement comes: {why}")
         problems += filter(None, (self._recordings.problem(), self._loop.problem))
-        idle = "passing" if self._loop.is_driven else "idle" if self._held is None else "holding"
+        held = "idle" if self._loop.held is None else "holding"
         values: dict[str, object] = {
-            "state": idle,
+            "state": "passing" if self._loop.is_driven else held,
             "experiment": "",
             "rate [Hz]": float(self._sensor.arrivals()),
             "age of the last sample [s]": self._sensor.since_message,
