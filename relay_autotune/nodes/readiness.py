@@ -226,8 +226,7 @@ class Readiness:
             parameters, baseline = _on_setpoint(parameters)
         else:
             parameters.validate()
-            mean, held = self._loop.mean_command(), self._loop.held
-            baseline = _baseline_from(values["baseline"], mean, held)
+            baseline = self._baseline(values["baseline"])
         parameters.validate(baseline)
         policy = _policy_from(values, connected=self._loop.is_connected)
         # A feedback of the position, or the controller of a closed loop, also shows where the
@@ -236,6 +235,20 @@ class Readiness:
         from_small = not (shows_ends or parameters.finds_amplitude)
         period = last[1].period if last is not None else math.nan
         return Ready(parameters, baseline, policy, from_small, period)
+
+    def _baseline(self, given: float) -> float:
+        """Return the command of the operating point [u].
+
+        :param given: the parameter ``baseline`` [u]; NaN: the mean of the present controller's
+            commands, else the command that is held.
+        :raises NotReadyError: if it is not known from any of them.
+        """
+        for known in (given, self._loop.mean_command()):
+            if not math.isnan(known):
+                return known
+        if self._loop.held is None:
+            raise NotReadyError(Code.NO_BASELINE())
+        return self._loop.held
 
     def _measured(self) -> str:
         """Say who measures, and how; refuse a start without measurements, as the graph shows."""
@@ -291,23 +304,6 @@ def _within(parameters: ExperimentParameters, newest: float | None) -> str:
         return "the measurement is within its limits"
     limit, way = ("measurement_min", "lower") if newest < low else ("measurement_max", "higher")
     raise NotReadyError(Code.BEYOND_LIMITS(value=newest, low=low, high=high, way=way, limit=limit))
-
-
-def _baseline_from(parameter: float, mean: float, held: float | None) -> float:
-    """Return the command of the operating point.
-
-    :param parameter: the parameter ``baseline`` [u]; NaN: not given.
-    :param mean: mean of the present controller's commands [u]; NaN: no controller is connected.
-    :param held: the command that the node holds now [u]; None: it has not sent a command.
-    :raises NotReadyError: if the baseline is not known from any of them.
-    """
-    if not math.isnan(parameter):
-        return parameter
-    if not math.isnan(mean):
-        return mean
-    if held is None:
-        raise NotReadyError(Code.NO_BASELINE())
-    return held
 
 
 def _on_setpoint(parameters: ExperimentParameters) -> tuple[ExperimentParameters, float]:

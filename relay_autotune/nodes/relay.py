@@ -348,7 +348,7 @@ class RelayNode(ServedNode):
     def _leave(self, session: Session, command: float) -> None:
         # The safe command is out. Slow work is deferred until the callback has returned.
         self._session = None
-        session.lost_samples = self._lost()
+        session.lost_samples = self._sensor.lost
         self._loop.give_back(session.experiment, command)
         self.defer(partial(self._complete, session))
 
@@ -415,7 +415,7 @@ class RelayNode(ServedNode):
         sentence = session.experiment.status
         if (age := self._sensor.age) > max(SILENT, 2.0 * self._sensor.samples.interval):
             sentence += f"; no measurement for {duration(age)}"
-        lost = self._lost()
+        lost = self._sensor.lost
         return f"{sentence}; {Code.NOTE_LOST(samples=lost)}" if lost else sentence
 
     def _tell(self, status: str) -> None:
@@ -428,11 +428,6 @@ class RelayNode(ServedNode):
         """The tune that runs, else the last that waits for its model."""
         waiting = (t for t in reversed(self._tunes.values()) if t.recording.is_waiting)
         return self._session or next(waiting, None)
-
-    def _lost(self) -> int:
-        # Sequence numbers of several publishers cannot be distinguished.
-        alone = self._sensor.subscription.get_publisher_count() <= 1
-        return self._sensor.lost if alone else 0
 
     def _now_ns(self) -> int:
         return int(self.get_clock().now().nanoseconds)
@@ -455,7 +450,7 @@ class RelayNode(ServedNode):
         }
         summary = self._summary
         if session is not None:
-            values |= session.facts(self._lost())
+            values |= session.facts(self._sensor.lost)
             summary = f"tune {session.id}: {self._words()}"
         status = DiagnosticStatus(
             level=DiagnosticStatus.WARN if problems else DiagnosticStatus.OK,

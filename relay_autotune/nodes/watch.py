@@ -252,8 +252,7 @@ class Sensor:
         """The last measurements."""
         self.misread: Reason | None = None
         """Why the last message could not be read; None: it could."""
-        self.lost = 0
-        """Samples lost since `begin`, by the publisher's numbers."""
+        self._lost = 0
         self._arrived = -math.inf
         self._arrivals = self._sequence = 0
 
@@ -308,8 +307,13 @@ class Sensor:
         self._arrivals += 1
         if number is not None:
             if number > self._sequence + 1 and self._sequence:
-                self.lost += number - self._sequence - 1
+                self._lost += number - self._sequence - 1
             self._sequence = number
+
+    @property
+    def lost(self) -> int:
+        """Samples lost since `begin`, by the numbers of its only publisher."""
+        return self._lost if self.subscription.get_publisher_count() <= 1 else 0
 
     def arrivals(self) -> int:
         """Return the number of messages since this was last asked."""
@@ -333,7 +337,7 @@ class Sensor:
 
     def begin(self) -> None:
         """Begin a tune: count silence and losses from here on."""
-        self.lost, self._arrived = 0, time.monotonic()
+        self._lost, self._arrived = 0, time.monotonic()
 
     @property
     def timeout(self) -> float:
