@@ -293,9 +293,10 @@ class RelayNode(ServedNode):
         taken = self._results.take(name, message, running, self._on_setpoint)
         for topic, found in taken:
             if (tune := self._tunes.get(found.experiment_id)) is not None:
-                tune.recording.message(topic, now, found)
+                # The last result closes the recording, and that ends the goal.
                 if tune.goal is not None:
                     tune.goal.note(topic, found)
+                tune.recording.message(topic, now, found)
         if name == MODEL and message.final and not taken:
             # Gains without a model are no result: waiting longer brings nothing.
             self._note_progress(message.experiment_id, False, self._results.refusals.last)
