@@ -224,7 +224,7 @@ def test_the_true_structure_given_its_errors_are_those_stated(name):
 def test_a_structure_that_is_not_in_the_data_can_be_forced():
     found = identify_waveform(_record(PROCESSES["lag_n"], 0.02), Known(structure="fopdt"))
     assert found.structure == "fopdt"
-    assert any("not white" in w for w in found.warnings)
+    assert any("is correlated" in w for w in found.warnings)
 
 
 @pytest.mark.long

@@ -220,7 +220,7 @@ def test_a_limit_cycle_that_no_structure_explains_gives_a_warning_or_a_reason(se
         assert str(reason)
         return
     assert np.all(np.isfinite(found.values))
-    assert any("not white" in w or "larger than the noise" in w for w in found.warnings)
+    assert any("is correlated" in w or "larger than the noise" in w for w in found.warnings)
 
 
 def test_a_part_with_one_model_says_nothing_of_the_scatter_between_parts():

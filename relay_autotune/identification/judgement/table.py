@@ -224,7 +224,7 @@ MODEL_CHECKS = (
         "together with the rest",
         unit="",
         doubtful=0.5,
-        sentence="{value} of the record is left out: the model rests on the others",
+        sentence="{value} of the record is left out, and the model rests on the rest of it",
         remedy="repeat the test while nothing else acts on the process, and look whether the "
         "actuator goes as far as its command",
         measure=_left_out,

@@ -121,12 +121,14 @@ class NoResponseError(IdentificationError):
     """
 
     def __init__(self, known: Known) -> None:
-        may = f", or leave the structure open: it may not be {known.structure}"
+        found = "shows no response to the command"
+        if known.structure:
+            found = f"shows no response of a {known.structure} to the command"
         super().__init__(
-            "the measurement shows no response to the command beyond its noise and a slow "
-            "disturbance: record from a rest on, raise the amplitude, move the command more "
-            "often, leave out parts in which something else acts, and check that both topics "
-            f"belong to one loop{may if known.structure else ''}"
+            f"the measurement {found} beyond its noise and a slow disturbance: "
+            f"{'leave the structure open, ' * bool(known.structure)}record from a rest on, raise "
+            "the amplitude, move the command more often, leave out parts in which something else "
+            "acts, and check that both topics belong to one loop"
         )
 
 

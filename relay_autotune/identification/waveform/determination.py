@@ -120,14 +120,17 @@ def _for_fast(found: Identification, names: Sequence[str], tests: _Tests) -> lis
     said = []
     text = ", ".join(name.replace("_", " ") for name in names)
     fast = found.model.dead_time
-    if fast < _FEW_SAMPLES * tests.interval:
+    ends = zip(found.estimate.structure.parameters, found.ci95_high, strict=True)
+    longest = max((float(b) for p, b in ends if p.name in names and p.unit == "s"), default=fast)
+    if longest < _FEW_SAMPLES * tests.interval:
         said.append(
-            f"faster sampling would help with the {text}: the dead time is {digits(fast, 2)} s, "
-            f"the time between samples {digits(tests.interval, 2)} s"
+            f"faster sampling would help with the {text}, which may be {digits(longest, 2)} s at "
+            f"most: the time between samples is {digits(tests.interval, 2)} s"
         )
     elif not tests.relay:
-        half = math.pi / found.ultimate_frequency
-        half = half if math.isfinite(half) else 2.0 * fast
+        half = 2.0 * _apparent_dead_time(found.model)
+        if found.ultimate_frequency_std < found.ultimate_frequency:
+            half = math.pi / found.ultimate_frequency
         said.append(
             f"a few steps to and fro in the same record, each held for about {digits(half, 2)} s, "
             f"would tell the {text} apart: it takes fast changes"

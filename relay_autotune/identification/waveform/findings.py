@@ -278,9 +278,9 @@ def _warnings(
     found = []
     if fit.problem.colour is not None:
         found.append(
-            "what the model leaves is not white: its colour was estimated with the model (an "
-            f"autoregression of order {fit.problem.colour.order}), and intervals and the choice "
-            "of a structure allow for it"
+            "what the model leaves is correlated: an autoregression of order "
+            f"{fit.problem.colour.order} explains more of it than white noise does; it was "
+            "estimated with the model, and intervals and the choice of a structure allow for it"
         )
     step = coarse_step(records, quality.residual_rms)
     if step:
