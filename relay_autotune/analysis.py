@@ -236,7 +236,7 @@ class _Chosen:
 
         :param known: known values of the process.
         """
-        known = replace(used_by(DEFAULT_METHOD, known), structure=FOPDT.name)
+        known = replace(used_by(DEFAULT_METHOD, known), structure=FOPDT.name, order=0)
 
         def fit() -> Identification:
             beside = None if self.plain is None else self.plain()

@@ -25,7 +25,8 @@ class Known:
     >>> facts.gain, facts.structure
     (1.65, 'fopdt')
 
-    :raises ParameterError: if a value is out of its range, or the gain is zero.
+    :raises ParameterError: if a value is out of its range, the gain is zero, or the structure has
+        another order than the one given.
     """
 
     gain: float = quantity(math.nan, "y/u", zero=False).means(
@@ -47,6 +48,12 @@ class Known:
 
     def __post_init__(self) -> None:
         check(self, ParameterError)
+        row = TABLE.get(self.structure)
+        if row and not row.any_order and self.order not in (0, row.order):
+            raise ParameterError(
+                f"the structure {self.structure} has {row.order} lags, but the order given is "
+                f"{self.order}: leave one of the two out"
+            )
 
 
 NOTHING = Known()

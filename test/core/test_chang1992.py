@@ -16,7 +16,7 @@ from relay_runs import simulate_relay
 from sampled_relay import exact_limit_cycle, simulate_sampled_relay
 from worked_cases import cases
 
-from relay_autotune.errors import IdentificationError
+from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.methods import identify
@@ -394,7 +394,7 @@ def test_a_structure_that_does_not_fit_is_said_to():
         chang_from_numbers(_example(), Known(gain=1.65, structure="ipdt"))
     with pytest.raises(IdentificationError, match="needs its order"):
         chang_from_numbers(_example(), Known(gain=1.65, structure="lag_n"))
-    with pytest.raises(IdentificationError, match="leave one of the two out"):
-        chang_from_numbers(_example(), Known(gain=1.65, structure="sopdt", order=3))
+    with pytest.raises(ParameterError, match="leave one of the two out"):
+        Known(gain=1.65, structure="sopdt", order=3)
     with pytest.raises(IdentificationError, match="needs the gain"):
         chang_from_numbers(_example(), Known(structure="sopdt"))

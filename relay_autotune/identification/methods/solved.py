@@ -183,11 +183,6 @@ def structure_asked_for(
                 f"the structure {name} needs its order, the number of equal lags: give it"
             )
         return equal_lags(order)
-    if order not in (0, found.order):
-        raise IdentificationError(
-            f"the structure {name} has {found.order} lags, but the order given is {order}: leave "
-            "one of the two out"
-        )
     return found
 
 
