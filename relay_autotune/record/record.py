@@ -279,8 +279,18 @@ class PiecewiseLinear:
 Input = PiecewiseConstant | PiecewiseLinear
 
 
+# Kinds of numpy's types that hold real numbers: booleans, integers, floats, Python's own numbers.
+_REAL = "biufO"
+
+
 def _as_column(name: str, value: object, length: int | None) -> FloatArray:
-    array = np.array(value, dtype=np.float64)
+    given = np.asarray(value)
+    if given.dtype.kind not in _REAL:
+        raise RecordError(
+            f"{name} of a record must hold real numbers, found {given.dtype}: give times in "
+            "seconds, such as (t - t[0])/numpy.timedelta64(1, 's') of dates"
+        )
+    array = np.array(given, dtype=np.float64)
     if array.ndim != 1 or (length is not None and array.size != length):
         expected = "(n,)" if length is None else f"({length},)"
         raise RecordError(f"{name} of a record must have shape {expected}, found {array.shape}")

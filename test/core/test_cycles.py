@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -322,3 +323,11 @@ def test_any_command_gives_valid_cycles(command, steps):
         assert all(
             math.isfinite(getattr(cycle, name)) for name in ("mean_measurement", "mean_command")
         )
+
+
+@pytest.mark.parametrize("unit", ["datetime64[ns]", "timedelta64[ms]", "complex128", "str"])
+def test_columns_of_dates_or_other_things_than_real_numbers_are_refused(unit):
+    """The nanoseconds of a date had passed for seconds."""
+    column = np.arange(10).astype(unit)
+    with pytest.raises(RecordError, match=re.escape(f"real numbers, found {column.dtype}")):
+        Record(time=column, measurement=np.zeros(10), command=np.zeros(10))
