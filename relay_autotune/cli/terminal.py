@@ -350,10 +350,13 @@ def agrees(question: str, *, yes: bool, back: bool = False) -> bool:
         return True
     _require_somebody("--yes")
     _forget_typed()
-    answer = _input(f"\n{question} [y/N] ").lower()
-    if back and answer == BACK:
-        raise GoBack
-    return answer in ("y", "yes")
+    while True:
+        answer = _input(f"\n{question} [y/N] ").lower()
+        if back and answer == BACK:
+            raise GoBack
+        if answer in ("", "n", "no", "y", "yes"):
+            return answer.startswith("y")
+        print("expected y or n", file=sys.stderr)
 
 
 def end_with_terminal() -> None:

@@ -563,21 +563,22 @@ def test_an_answer_that_was_mistyped_is_changed_at_the_next_question(
         "baseline": 2.0, "safe_command": 2.0, "measurement_min": 30.0, "measurement_max": 50.0,
         "command_min": 1.0, "command_max": 6.0,
     }  # fmt: skip
-    typed += ["<"]
+    typed += ["<", ""]
     assert not agrees("Start the tune?", yes=False)
+    assert not typed
 
 
 def test_a_tune_that_nobody_agrees_to_is_said_not_to_start(
     typed: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    typed += ["maybe"]
+    typed += ["maybe", "no"]
     given = SimpleNamespace(yes=False, dry_run=False)
     loop: Any = SimpleNamespace(
         plan=list, check=lambda deadline: None, answers=SimpleNamespace(may_go_back=False)
     )
     session: Any = SimpleNamespace(options=given, _may_start=lambda loop, found: True)
     assert not tune_loop.Session._is_agreed(session, loop, math.inf)
-    assert capsys.readouterr().err.endswith("tune_loop: not started\n")
+    assert capsys.readouterr().err.endswith("expected y or n\ntune_loop: not started\n")
 
 
 def test_units_that_are_typed_or_that_messages_say_stand_everywhere(
