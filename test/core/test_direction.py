@@ -11,9 +11,12 @@ from virtual_tune import tuned
 
 from relay_autotune.analysis import analyse
 from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.process.response import response
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import Outcome
+from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.record import Outcome, PiecewiseConstant, Record
+from relay_autotune.verdict import Verdict
 
 pytestmark = pytest.mark.long
 
@@ -82,3 +85,18 @@ def test_what_a_disturbance_leaves_does_not_speak_for_the_other_direction(acting
     found = analyse(tune.record(), alone=True)
     assert all(m.process_sign == 1 for m in found.model.draws)
     assert found.best_gains is not None
+
+
+@pytest.mark.parametrize(("zero", "before"), [(-8.0, 4), (6.0, 2)])
+def test_a_step_that_begins_with_the_record_keeps_its_direction(zero, before):
+    """A command or a movement just before the record had stood for the zero, 30 times as large."""
+    rng, n, interval = np.random.default_rng(1), 450, 0.3
+    time = interval * np.arange(n)
+    process = TransferFunction(1.0, (zero,), (11.0, 8.0), 0, 0.6)
+    u = PiecewiseConstant(time[[before]], np.array([60.0]), 50.0)
+    y = 40.0 + response(process, time, u) + 0.03 * rng.standard_normal(n)
+    command = np.where(np.arange(n) < before, 50.0, 60.0)
+    found = analyse(Record(time=time, measurement=y, command=command), alone=True)
+    assert found.verdict is Verdict.TRUSTED
+    assert found.model.model.gain == pytest.approx(1.0, rel=0.02)
+    assert found.model.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.1)

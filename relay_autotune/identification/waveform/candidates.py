@@ -583,11 +583,23 @@ def needs_no_past(problem: Problem, sign: int) -> bool:
     :param problem: all samples.
     :param sign: the direction in which the relay worked, 1 or -1; 0: not known.
     """
-    return not sign and all(
-        changes_within(u, problem.time[part]).size < MANY
-        and begins_at_rest(problem.time[part], problem.y[part], u)
-        for part, u in zip(problem.experiments, problem.inputs, strict=True)
+    return (
+        not sign
+        and moves_seldom(problem)
+        and all(
+            begins_at_rest(problem.time[part], problem.y[part], u)
+            for part, u in zip(problem.experiments, problem.inputs, strict=True)
+        )
     )
+
+
+def moves_seldom(problem: Problem) -> bool:
+    """Return whether no command moves often enough to tell what came before the record.
+
+    :param problem: all samples.
+    """
+    parts = zip(problem.experiments, problem.inputs, strict=True)
+    return all(changes_within(u, problem.time[part]).size < MANY for part, u in parts)
 
 
 def drop_first_dead_time(problem: Problem, state: Trial) -> Problem:

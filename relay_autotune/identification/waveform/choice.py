@@ -29,6 +29,7 @@ from relay_autotune.identification.waveform.candidates import (
     FitContext,
     as_in,
     drop_first_dead_time,
+    moves_seldom,
     nuisances_of,
 )
 from relay_autotune.identification.waveform.fit_covariance import Fit, raw_residual
@@ -347,6 +348,10 @@ def _compared(
     if not simple:
         return []
     decided = _with_best_terms(context, simple)
+    before_it = any(nuisances_of(decided.problem, ("relaxation", "past")))
+    if before_it and moves_seldom(context.problem) and not known.structure:
+        # What came just before a step acts as a zero does, which no simple structure has.
+        decided = _with_best_terms(context, [decided, *context.fit([SOPDT_ZERO.name])])
     found = _with_terms(context, known, names, decided, simple)
     if not found or context.loads or len(context.problem.bounds) > 1:
         return found
