@@ -155,9 +155,10 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
     notes = [*table.notes, *said]
     names = [table.names[at] for at in pair]
     if wanted.measurement is None and wanted.command is None:
-        why = _swap(path, names, *values)
-        if why:
+        swapped, why = _order(path, names, *values)
+        if swapped:
             names, values = names[::-1], values[::-1]
+        if why:
             notes.append(
                 f"{names[1]!r} is taken as the command and {names[0]!r} as the measurement, "
                 f"{why}; --measurement and --command name others"
@@ -498,8 +499,10 @@ def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[tuple[st
     return (of_one or found)[:_MOST_CHOICES]
 
 
-def _swap(path: Path, names: Sequence[str], first: FloatArray, second: FloatArray) -> str:
-    """Return why the first of two columns is the command; empty: the second is.
+def _order(
+    path: Path, names: Sequence[str], first: FloatArray, second: FloatArray
+) -> tuple[bool, str]:
+    """Return whether the first of two columns is the command, and why; empty: as is usual.
 
     :raises SelectionError: if one is a set-point, of which nothing can be identified.
     """
@@ -514,9 +517,11 @@ def _swap(path: Path, names: Sequence[str], first: FloatArray, second: FloatArra
         # One name alone may be that of a part on either side: "T_out" and "flow", or "Ausgang".
         in_steps = _steps(first), _steps(second)
         if in_steps[0] != in_steps[1]:
-            return "since it moves in steps" if in_steps[0] else ""
-    swapped = roles[0] != roles[1] and (roles[0] == COMMAND or roles[1] == MEASUREMENT)
-    return "as their names say" if swapped else ""
+            return in_steps[0], "since it moves in steps"
+    if roles[0] == roles[1]:
+        return False, "since it comes last"
+    swapped = roles[0] == COMMAND or roles[1] == MEASUREMENT
+    return swapped, "as their names say" if swapped else ""
 
 
 def _steps(values: FloatArray) -> bool:

@@ -47,6 +47,8 @@ OVERRIDABLE = {"qos_overriding_options": QoSOverridingOptions.with_default_polic
 
 # Topics of every node, and how many others are named where one is missing.
 _COMMON = {"/rosout", "/parameter_events"}
+# Types of what this package publishes of a tune: no sensor, and no actuator.
+_RESULTS = "relay_autotune_msgs/"
 _MOST_NAMED = 4
 
 # A killed process stays in the graph for some 20 s. With this liveliness lease a subscriber
@@ -153,7 +155,7 @@ def nearest(
     :param node: the node that looks for the topic.
     :param topic: the resolved name that is missing.
     :param ends_of: returns the ends that a topic must have: publishers, or subscriptions.
-    :param kind: the message type; empty: any.
+    :param kind: the message type; empty: any but those of a tune's results.
     :return: its name, empty if there is none; " (others: ...)", empty if there are none.
     """
     mine = node.get_fully_qualified_name()
@@ -163,7 +165,7 @@ def nearest(
         (
             other
             for other, kinds in node.get_topic_names_and_types()
-            if (not kind or kind in kinds)
+            if (kind in kinds if kind else not kinds[0].startswith(_RESULTS))
             and other not in own
             and any(who(e) != mine for e in ends_of(other))
         ),

@@ -276,9 +276,22 @@ def test_a_header_may_be_missing(tmp_path):
     text = "\n".join(line(k) for k in range(20))
     found = read_experiments(write(tmp_path / "a.csv", text))
     same_as_plain(tmp_path, found)
-    assert found.notes == ("there is no header line; the columns are called '1', '2', '3'",)
+    assert found.notes == (
+        "there is no header line; the columns are called '1', '2', '3'",
+        "'3' is taken as the command and '2' as the measurement, since it moves in steps; "
+        "--measurement and --command name others",
+    )
     chosen = read_experiments(tmp_path / "a.csv", Selection("2", "3", "1"))
     same_as_plain(tmp_path, chosen)
+
+
+def test_a_choice_of_columns_that_nothing_speaks_for_is_told(tmp_path):
+    """A measurement that was taken for the command had given gains without a word on it."""
+    rows = "\n".join(f"{k},{k % 7}.5,{k % 5}.25" for k in range(60))
+    found = read_experiments(write(tmp_path / "a.csv", f"a,b,c\n{rows}"))
+    assert found.notes[-1].startswith(
+        "'c' is taken as the command and 'b' as the measurement, since it comes last; "
+    )
 
 
 def stamped(form):
