@@ -171,14 +171,14 @@ class TextTable:
                 )
             names = [str(number) for number in range(1, width + 1)]
             why = "there is no header line"
-            if above and not _is_data(above[-1][1]) and sum(map(bool, above[-1][1])) > width // 2:
+            if above and not _is_data(above[-1][1]) and 2 * sum(map(bool, above[-1][1])) >= width:
                 count = len(above[-1][1])
                 why = (
                     f"line {above[-1][0]} has {count} names and the rows have {width} cells, so "
                     "that it does not tell which is which"
                 )
-                if self._separator == "," and width == 2 * count - 1:
-                    # Each number but the time stands in two cells.
+                if self._separator == "," and width in (2 * count - 1, 2 * count):
+                    # Each number stands in two cells, unless the time has no decimals.
                     raise BagError(f"{self._path}: {why}{_COMMAS}")
             self.notes.append(f"{why}; the columns are called {listed(names)}")
             return names

@@ -285,6 +285,12 @@ def test_a_header_may_be_missing(tmp_path):
     same_as_plain(tmp_path, chosen)
 
 
+def test_decimal_commas_between_commas_are_no_columns(tmp_path):
+    rows = "\n".join(f"{k},0000,{k % 7},5000,{k % 5},2500" for k in range(60))
+    with pytest.raises(BagError, match=r"3 names and the rows have 6 cells.*decimal points"):
+        read_experiments(write(tmp_path / "a.csv", f"t,u,y\n{rows}"))
+
+
 def test_a_choice_of_columns_that_nothing_speaks_for_is_told(tmp_path):
     """A measurement that was taken for the command had given gains without a word on it."""
     rows = "\n".join(f"{k},{k % 7}.5,{k % 5}.25" for k in range(60))
