@@ -413,9 +413,7 @@ def _gains(gains: Gains, verdict: Verdict, series: Sequence[str]) -> list[_Entry
     # Gains of a message come without it.
     bare: Performance | None = getattr(gains, "bare", None)
     if bare is not None:
-        lines.append(
-            ("", f"without filter tf and weight b: {_step(bare)}   Ms {digits(bare.ms, 3)}")
-        )
+        lines.append(("", f"without {gains.softeners}: {_step(bare)}   Ms {digits(bare.ms, 3)}"))
     if gains.reason:
         lines.append(("  because", gains.reason))
     return lines + [("  warning", warning) for warning in gains.warnings]

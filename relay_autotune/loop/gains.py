@@ -251,6 +251,12 @@ class Gains(Performance, Controller):
         Controller.__post_init__(self)
         Performance.__post_init__(self)
 
+    @property
+    def softeners(self) -> str:
+        """What there is beside p, i and d, for a sentence: filter, set-point weight, or both."""
+        there = {"filter tf": self.tf > 0.0, "weight b": self.b != 1.0}
+        return " and ".join(name for name, is_there in there.items() if is_there)
+
 
 @dataclass(frozen=True)
 class InternalModelLaw:

@@ -110,7 +110,7 @@ def steps_of(case: Case) -> tuple[str, ...]:
         )
         if gains.bare is not None:
             watch += (
-                f" (without filter tf and weight b: {percent(gains.bare.overshoot)} % and "
+                f" (without {gains.softeners}: {percent(gains.bare.overshoot)} % and "
                 f"{digits(gains.bare.settling_time, 2)} s)"
             )
     steps = (
