@@ -122,14 +122,14 @@ class NoResponseError(IdentificationError):
     """
 
     def __init__(self, known: Known) -> None:
-        found = "shows no response to the command"
+        of, first = "", ""
         if known.structure:
-            found = f"shows no response of a {known.structure} to the command"
+            of, first = f" of a {known.structure}", "leave the structure open, "
         super().__init__(
-            f"the measurement {found} beyond its noise and a slow disturbance: "
-            f"{'leave the structure open, ' * bool(known.structure)}record from a rest on, raise "
-            "the amplitude, move the command more often, leave out parts in which something else "
-            "acts, and check that both topics belong to one loop"
+            f"the measurement shows no response{of} to the command beyond its noise and a slow "
+            f"disturbance: {first}record from a rest on, raise the amplitude, move the command "
+            "more often, leave out parts in which something else acts, and check that both topics "
+            "belong to one loop"
         )
 
 
@@ -351,7 +351,8 @@ def _compared(
     before_it = any(nuisances_of(decided.problem, ("relaxation", "past")))
     if before_it and moves_seldom(context.problem) and not known.structure:
         # What came just before a step acts as a zero does, which no simple structure has.
-        decided = _with_best_terms(context, [decided, *context.fit([SOPDT_ZERO.name])])
+        zeros = (_with_best_terms(context, [c]) for c in context.fit([SOPDT_ZERO.name]))
+        decided = min((decided, *zeros), key=lambda c: _in_own_colour(context, c).score)
     found = _with_terms(context, known, names, decided, simple)
     if not found or context.loads or len(context.problem.bounds) > 1:
         return found
