@@ -138,7 +138,7 @@ class RelayNode(ServedNode):
                 self._answer_later(session)
         else:
             self._loop.answer(value)
-            self._sensor.samples.add(value, info["source_timestamp"])
+            sensor.samples.add(value, info["source_timestamp"])
         if self._reported is not None:
             # After the answer: it belongs to this sample, and the one before is still needed.
             try:
@@ -146,7 +146,7 @@ class RelayNode(ServedNode):
             except FieldError as error:
                 what, why = "controller's command", str(error)
                 self._stop_now(Code.MISREAD(what=what, topic=self._topic, why=why))
-        self._sensor.count(info["publication_sequence_number"])
+        sensor.count(info["publication_sequence_number"])
 
     def _on_silence(self, value: float, ago: float) -> None:
         """Take the last measurement again: a silent sensor means that it has not changed."""
