@@ -238,10 +238,11 @@ class AfterTune(Tuned):
         steps = self._own_controller() if loop.proves and not against else []
         first = _Written(gains, exports_of(gains.law)[0], against or self.doubt)
         written, file = first, options.export
-        if loop.proves and not (file or options.yes) and sys.stdin.isatty():
+        asks = loop.proves and not (file or options.yes) and sys.stdin.isatty()
+        if asks:
             written, file = self._asked(first, against)
-        if file:
-            self._write(written, file)
+        while file and not self._write(written, file) and asks:
+            written, file = self._asked(first, against)
         if written.gains is not gains and not against:
             law = {"law": written.gains.law, "sample_period": written.gains.law_period}
             steps.append(self._to_prove(f"prove those for {written.how}", **law))
@@ -260,27 +261,29 @@ class AfterTune(Tuned):
         again = as_typed(options, verify=None, **law)
         return what, f"{prefix()}{again}{'' if self.doubt else ' --verify'}"
 
-    def _write(self, written: _Written, file: str) -> None:
+    def _write(self, written: _Written, file: str) -> bool:
+        """Write gains to a file; return whether they are there."""
         # The tune is made, and its recording has the gains.
         bag = shlex.quote(self.result.bag or "BAG")
         again = f"{prefix()}replay {bag} --export {written.how}"
         if written.doubt and self.options.export and not self.options.accept_doubtful:
             again += " --accept-doubtful"
             say(PROGRAM, f"{file} is not written: the gains are doubtful; to have it: {again}")
-            return
+            return False
         try:
             text = exported(written.gains, written.how, self.loop.target, doubt=written.doubt)
         except SelectionError as error:
             say(PROGRAM, f"{file} is not written: {error}, such as {again}")
-            return
+            return False
         try:
             write(text, file)
         except SelectionError as error:
             if self.options.export:
                 raise
             say(PROGRAM, f"{error}; to have the gains: {again}")
-            return
+            return False
         print(f"  {'gains for':<16} {written.how}: {Path(file).resolve()}")
+        return True
 
     def _asked(self, first: _Written, against: str) -> tuple[_Written, str]:
         """Ask for which program the gains are to be written, and to which file.

@@ -975,11 +975,22 @@ def test_a_file_that_needs_limits_is_written_from_the_recording(
     shown: Callable[..., str], tmp_path: Path
 ) -> None:
     asked = ("arduino_pid_v1", "0.5", "sketch.ino")
-    told = shown(None, "", *asked, bag="tune", command_within=None)
+    told = shown(None, "", *asked, "none", bag="tune", command_within=None)
     assert not (tmp_path / "sketch.ino").exists()
     assert "NEXT control with these gains" in told
     shown(None, "", *asked, bag="tune")
     assert "const auto OutputMax = 100.0;" in (tmp_path / "sketch.ino").read_text()
+
+
+def test_a_typed_file_that_cannot_be_written_is_asked_for_again(
+    shown: Callable[..., str], tmp_path: Path
+) -> None:
+    taken = tmp_path / "taken.yaml"
+    taken.write_text("mine")
+    told = shown(None, "", "taken.yaml", "nowhere/gains.yaml", "gains.yaml")
+    assert taken.read_text() == "mine"
+    assert f"controller_node: {tmp_path / 'gains.yaml'}" in told
+    assert (tmp_path / "gains.yaml").exists()
 
 
 def test_gains_that_failed_are_not_recommended_and_their_file_says_so(
