@@ -117,7 +117,7 @@ def analyse(
     >>> print(found.model.model)
     0.6204 e^(-15.89 s) / (1 + 110.2 s)
     >>> print(found.best_gains)
-    kc = 4.813, ti = 41.85 s, td = 7.556 s
+    kc = 4.4, ti = 44.18 s, td = 8.474 s
 
     Data without a usable model are a result, not an exception: the reason says what was found and
     what to do. Only a completed experiment, or data without any outcome, yield gains, and only if
@@ -377,7 +377,7 @@ def _judged(
     record, options = found.record, asked.options
     task = task_of_record(chosen, record, options, simple, rng, beside)
     shaping = Shaping(task, evidence, findings)
-    chosen = warned_of_rows(chosen, record, options)
+    chosen = warned_of_rows(chosen, record)
     found = replace(found, models=(chosen, *others), shaping=shaping)
     tuned = _tuned(found, task, asked.rule, () if alone else tuple(RULES))
     gains = tuned.best_gains

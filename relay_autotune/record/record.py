@@ -321,7 +321,8 @@ class Record:
     <Record: 3 samples over 1 s, recorded elsewhere>
 
     ``command[i]`` is the answer to ``measurement[i]``; it was sent at ``command_time[i]`` and
-    held until the next one.
+    held until the next one. Rows of a table, where that is ``time[i]``, do not tell when since
+    the row before it moved: gains allow for each instant, unless ``held_input`` has it.
 
     :param time: when each sample was taken, on the sensor's clock [s from the first sample],
         shape (n,), not decreasing.

@@ -16,6 +16,7 @@ from relay_autotune.identification.judgement.difference import Difference
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.posterior import DRAWS
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import LONGEST, SHORTEST
 from relay_autotune.record.cycles import cycles_of, limit_cycle
 from relay_autotune.record.record import Record
@@ -23,6 +24,9 @@ from relay_autotune.text import digits
 from relay_autotune.tuning.ensemble import ensemble
 from relay_autotune.tuning.rules.formulas import describing_point_of_cycle
 from relay_autotune.tuning.task import DesignOptions, DesignTask
+
+# Ratio of two values of K_u below which a user is told of both.
+_MUCH_LESS = 0.9
 
 
 def task_of_record(
@@ -43,11 +47,11 @@ def task_of_record(
     :param beside: what the record shows beside the model; None: it was not asked.
     """
     rng = rng or np.random.default_rng(0)
-    given, options = options, _with_noise(options, chosen, record)
+    options = _with_noise(options, chosen, record)
     models = ensemble(chosen, rng=rng)
     if beside is not None and not models:
         models = (chosen.model,) * DRAWS
-    unseen = _unseen(record, given)
+    unseen = _unseen(record)
     if unseen:
         options = replace(options, loop_delay=options.loop_delay + 0.5 * unseen)
         models = _spread_in_time(models, unseen, rng)
@@ -89,20 +93,18 @@ def _clock_of(record: Record) -> float:
     return float(f"{sampling_period(record):.3g}")
 
 
-def _unseen(record: Record, options: DesignOptions) -> float:
+def _unseen(record: Record) -> float:
     """Return how long before its row a change of the command may have come [s]; 0: not at all.
 
-    A controller that runs more often than the rows of a table is not the one that wrote them: it
-    moved the command anywhere between two of them, and what the model takes for its dead time is
-    too short by up to the time between them.
+    The rows of a table do not tell whether the command was taken before or after its controller
+    moved it, or between two moves. Dead times found in it are too short by up to the time from
+    the row before to that of the change.
     """
-    if not (record.is_table and options.sample_period > 0.0):
+    moved = np.flatnonzero(np.diff(record.command))
+    if not record.is_table or not moved.size:
         return 0.0
-    interval = sampling_period(record)
-    # Times in a table are rounded, so that an interval is its period to some digits only.
-    if math.isclose(interval, options.sample_period, rel_tol=1e-6):
-        return 0.0
-    return max(interval - options.sample_period, 0.0)
+    # In a log of changes alone the row before may be long ago: the usual time counts.
+    return min(float(np.median(np.diff(record.time)[moved])), record.interval)
 
 
 def _spread_in_time(
@@ -121,22 +123,21 @@ def _spread_in_time(
     )
 
 
-def warned_of_rows(
-    chosen: Identification, record: Record, options: DesignOptions
-) -> Identification:
-    """Add to a model's warnings what its record does not show of the command.
+def warned_of_rows(chosen: Identification, record: Record) -> Identification:
+    """Add to a model's warnings what its record does not show of the command, where it matters.
 
     :param chosen: the model.
     :param record: the record.
-    :param options: as they were given.
     """
-    unseen = _unseen(record, options)
-    if not unseen:
+    unseen = _unseen(record)
+    later = replace(chosen.model, dead_time=chosen.model.dead_time + unseen)
+    point = ultimate_point(later)
+    if point is None or abs(point.gain) > _MUCH_LESS * abs(chosen.ultimate_gain):
         return chosen
     warning = (
-        f"a change of the command may have come up to {digits(unseen, 3)} s before its row, "
-        "since the controller is to run more often than these were written: the gains allow "
-        "for as much more dead time; log faster, or add a row at each change"
+        f"a change of the command may have come up to {digits(unseen, 3)} s before its row, and "
+        f"K_u be as low as {digits(point.gain, 3)}: the gains allow for that; log faster, or "
+        "add a row just before and one just after each change"
     )
     return replace(chosen, warnings=(*chosen.warnings, warning))
 

@@ -49,8 +49,53 @@ def test_a_faster_controller_gets_gains_that_hold_whenever_the_command_changed(i
     assert any("before its row" in warning for warning in found.model.warnings)
 
 
+def _in_loop(*, late: int, doubled: bool = False) -> Record:
+    """Return rows of a lag of 10 s with a dead time of one row, each 1 s.
+
+    :param late: rows by which the command is logged after the measurement that it has moved.
+    :param doubled: whether a row stands just before and just after each change.
+    """
+    u = np.repeat([0.0, 10.0, 20.0, 10.0, 0.0, -10.0, 0.0], 30)
+    decay = np.exp(-0.1)
+    y = np.zeros(u.size + 2)
+    for k in range(u.size):
+        y[k + 2] = decay * y[k + 1] + (1.0 - decay) * u[k]
+    time, y = np.arange(u.size) * 1.0, y[: u.size]
+    y += np.random.default_rng(0).normal(0.0, 0.1, u.size)
+    logged = np.concatenate((u[:1].repeat(late), u[: u.size - late]))
+    if doubled:
+        at = np.flatnonzero(np.diff(u)) + 1
+        time = np.insert(time, at, time[at] - 0.001)
+        y, logged = np.insert(y, at, y[at]), np.insert(logged, at, u[at - 1])
+    return Record(time=time, measurement=y, command=logged)
+
+
+def _ms_of_loop(gains) -> float:
+    s = 1j * np.geomspace(1e-3, 10.0, 4000)
+    # The command is held for a row.
+    process = np.exp(-1.5 * s) / (1.0 + 10.0 * s)
+    law = gains.kc * (1.0 + 1.0 / (gains.ti * s) + gains.td * s)
+    return float(np.max(1.0 / np.abs(1.0 + process * law / (1.0 + gains.tf * s))))
+
+
+@pytest.mark.parametrize("late", [0, 1])
+def test_gains_hold_whichever_came_first_in_a_row(late):
+    found = analyse(_in_loop(late=late), alone=True)
+    assert found.verdict.name == "TRUSTED"
+    assert _ms_of_loop(found.best_gains) < 1.65
+    (warning,) = (w for w in found.model.warnings if "before its row" in w)
+    assert "up to 1.00 s" in warning
+
+
+def test_rows_about_each_change_tell_when_it_came():
+    found = analyse(_in_loop(late=0, doubled=True), alone=True)
+    assert not any("before its row" in warning for warning in found.model.warnings)
+    # As fast as Ms 1.4 allows, where rows alone leave 1.2.
+    assert 1.35 < _ms_of_loop(found.best_gains) < 1.5
+
+
 @pytest.mark.nightly
-def test_the_controller_that_wrote_the_table_is_told_nothing_of_it():
-    found = analyse(_logged(30.0, (600.0, 2220.0, 3900.0)), rule="robust", alone=True)
+def test_rows_that_are_close_against_the_dead_time_are_told_nothing_of_it():
+    found = analyse(_logged(2.0, (600.0, 2220.0, 3900.0)), rule="robust", alone=True)
     assert not any("before its row" in warning for warning in found.model.warnings)
     assert _true_ms(found.best_gains) < 1.5
