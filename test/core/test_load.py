@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from virtual_tune import tuned
 
-from relay_autotune.analysis import model_so_far
+from relay_autotune.analysis import analyse, model_so_far
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
@@ -165,3 +165,26 @@ def test_a_load_is_found_beside_white_noise_that_looks_coloured_by_chance():
     found = identify(record, "waveform")
     assert found.loaded
     assert found.model.gain == pytest.approx(3.0, rel=0.05)
+
+
+@pytest.mark.parametrize(("early", "delay"), [(0.4, 8.0), (0.5, 10.0)])
+def test_gains_hold_where_a_load_after_the_only_move_was_a_part_of_the_response(early, delay):
+    """Two paths to one measurement; Ms was infinite and 26, and the gains were trusted."""
+
+    def answer(t):
+        first, second = (1.0 - np.exp(-np.maximum(t - d, 0.0) / 8.0) for d in (3.0, 3.0 + delay))
+        return 10.0 * (early * first + (1.0 - early) * second)
+
+    time = np.arange(0.0, 90.0, 0.3)
+    y = answer(time - 9.0) + np.random.default_rng(1).normal(0.0, 0.1, time.size)
+    u = np.where(time >= 9.0 - 1e-9, 60.0, 50.0)
+    found = analyse(Record(time=time, measurement=y, command=u), alone=True)
+    assert any("a part of the response" in text for text in found.model.warnings)
+    gains, s = found.best_gains, 1j * np.geomspace(1e-3, 10.0, 20_000)
+    paths = early + (1.0 - early) * np.exp(-delay * s)
+    law = gains.kc * (1.0 + 1.0 / (gains.ti * s) + gains.td * s) / (1.0 + gains.tf * s)
+    loop = law * paths * np.exp(-3.15 * s) / (1.0 + 8.0 * s)
+    # Stable: the loop turns by no more than its own right angle about -1.
+    turn = np.unwrap(np.angle(1.0 + loop))
+    assert abs(turn[-1] - turn[0] - 0.5 * math.pi) < 0.1
+    assert np.max(1.0 / np.abs(1.0 + loop)) < 1.6

@@ -88,7 +88,8 @@ def test_the_design_holds_on_the_models_with_their_errors():
 def test_the_interval_of_the_ultimate_gain_holds_what_is_shown_beside_the_model():
     beside = errors()
     (rises,) = beside.rises
-    shown = Difference(beside.lags, rises, np.zeros((rises.size, 1)), 0.0, 0.0, LOWEST)
+    none = np.zeros((rises.size, 1))
+    shown = Difference(beside.lags, rises, none, 0.0, 0.0, LOWEST, none[:, 0], 0.0)
     found = replace(
         identified("waveform", Estimate.of_model(MODEL), 2.0),
         ultimate_gain_std=0.0,

@@ -14,6 +14,9 @@ response of the difference, and the noise an autoregression. The increments have
 about zero that decays with the lag; its size is the most likely one (stochastic embedding:
 Goodwin, Gevers and Ninness 1992), which is zero where noise alone explains the residual. So the
 difference has draws, as the model has, and each process that the record allows is a draw of both.
+
+What stands beside the model from the only move of a command on, as a load or a drift does, may be
+a part of the response as well: a share of the draws has it as such, by the odds of the two.
 """
 
 from __future__ import annotations
@@ -31,6 +34,7 @@ from relay_autotune.identification.waveform.residuals import Colour, colour_cost
 from relay_autotune.identification.waveform.separable import left_of
 from relay_autotune.process.model_set import ModelErrors
 from relay_autotune.process.response import response
+from relay_autotune.record.excitation import changes_within
 from relay_autotune.record.record import PiecewiseConstant, Record
 
 _BINS = 48
@@ -62,6 +66,8 @@ class Difference:
     :param unexplained: share of the measurement's variance that neither they nor noise explain,
         beside a slow drift.
     :param lowest: frequency of which the record shows one radian [rad/s].
+    :param late: increments of what stands beside the model, as a response [y/u], shape (m,).
+    :param share: probability that it is one.
     """
 
     lags: FloatArray
@@ -70,6 +76,8 @@ class Difference:
     residual: float
     unexplained: float
     lowest: float
+    late: FloatArray
+    share: float
 
     def draws(self, count: int, rng: np.random.Generator) -> ModelErrors:
         """Return responses drawn from its posterior.
@@ -78,7 +86,8 @@ class Difference:
         :param rng: the source.
         """
         normal = rng.standard_normal((count, self.root.shape[1]))
-        return ModelErrors(self.lags, self.mean + normal @ self.root.T, self.lowest)
+        late = np.outer(rng.random(count) < self.share, self.late)
+        return ModelErrors(self.lags, self.mean + normal @ self.root.T + late, self.lowest)
 
 
 def widened(found: Identification, beside: Difference | None) -> Identification:
@@ -183,7 +192,17 @@ def _difference(found: Identification, record: Record) -> Difference | None:
     )
     unexplained = max(noise - record.noise**2, 0.0) / max(total, 1e-300)
     lowest = 1.0 / record.duration
-    return Difference(edges, shown.mean, shown.root, residual, unexplained, lowest)
+    late, share = np.zeros(edges.size - 1), 0.0
+    moves, at = changes_within(u, time), time[known]
+    sizes = np.diff(u.levels)[np.isin(u.times, moves)]
+    if len(beside) == 3 and np.count_nonzero(sizes) == 1:
+        (begin,), (size,), curve = moves[sizes != 0.0], sizes[sizes != 0.0], nuisances[2, known]
+        curve = np.where(at < begin, 0.0, curve - np.interp(begin, at, curve))
+        response_too = np.vstack((nuisances[:2, known], curve))
+        other = _posterior(left[known], response_too, moved, prior)
+        share = 1.0 / (1.0 + math.exp(min(0.5 * (other.unlikely - shown.unlikely), 700.0)))
+        late = np.diff(np.interp(begin + edges, at, curve)) / size
+    return Difference(edges, shown.mean, shown.root, residual, unexplained, lowest, late, share)
 
 
 def _power_beside_lines(time: FloatArray, x: FloatArray, pieces: int) -> float:
