@@ -1,7 +1,7 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Checks whether a process is linear, on the data that a linear model was fitted to."""
+"""Checks whether a model is the process, and that linear, on the data that it was fitted to."""
 
 from __future__ import annotations
 
@@ -25,48 +25,69 @@ _ALIKE = 1e-6
 # Earlier samples that a controller's law may hold, a PID's with a filter, and the last samples of
 # a record that are looked at.
 _PAST, _MOST_CHANGES = 3, 20_000
+# Frequencies over which a spectrum is averaged.
+_NEAR = 5
 
 
-def read_backward(record: Record, model: TransferFunction) -> float | None:
+def read_backward(record: Record, model: TransferFunction, fitted: FloatArray) -> float | None:
     """Return how much of the command is a controller's whose inverse the model is, 0 to 1.
 
-    A command that a controller makes, ``u_k = sum_i a_i u_(k-i) + sum_j b_j y_(k-j) + c``, follows
-    each measurement at once, whereas a process answers later. The share s of what its own past
-    does not tell of u and y does is the controller's (as in Granger 1969); the rest came from
-    outside, and shows the process. With C = B/(1 - A) the law that was found and G the model, the
-    part of the command's power over frequency on which G is 1/C, ``d = 1 - |1 - G C|^2``, tells
-    whether the model is that law read backward. The number is ``s d``.
+    With the law of a controller, ``(1 - A) u = B y + v``, and the process, ``y = G u + e``,
+
+        (1 - A - B G) u = B e + v,
+
+    the command comes from v, which was given from outside as a set-point is, and from e, noise and
+    loads, to which the controller answered. Where e outweighs v, a fit may find G = (1 - A)/B, the
+    law read backward: exactly there ``|B e| = |v|``. So the part of the command's power over
+    frequency on which G is that inverse, ``d = 1 - |1 - G B/(1 - A)|^2``, counts by
+    ``|B e|^2/|v|^2``, at most 1. And a law follows each measurement at once, whereas a process
+    answers later: no more counts than the share of what the command's own past does not tell of
+    it that the measurement does (Granger 1969).
 
     :param record: any record.
     :param model: the model fitted to it.
-    :return: None where samples are few, or the command does not vary.
+    :param fitted: its measurement at the samples, NaN where it was not fitted, shape (n,).
+    :return: None where samples are few, or the command moves no more often than a law has numbers.
     """
-    u, y = (x[-_MOST_CHANGES:] - x.mean() for x in (record.command, record.measurement))
-    if u.size < _LEAST_SAMPLES or not (np.ptp(u) > 0.0 and np.ptp(y) > 0.0):
+    part = slice(-_MOST_CHANGES, None)
+    u, y = (x[part] - x.mean() for x in (record.command, record.measurement))
+    numbers = 2 * _PAST + 2
+    if u.size < _LEAST_SAMPLES or np.count_nonzero(np.diff(u)) <= numbers or not np.ptp(y) > 0.0:
         return None
     u_size, y_size = float(np.std(u)), float(np.std(y))
+    e = np.nan_to_num(record.measurement - fitted)[part][_PAST:] / y_size
     u, y = u / u_size, y / y_size
     own = [u[_PAST - k : u.size - k] for k in range(1, _PAST + 1)]
     seen = [y[_PAST - k : y.size - k] for k in range(_PAST + 1)]
-    now, constant = u[_PAST:], np.ones(u.size - _PAST)
+    now, constant = u[_PAST:], np.ones(e.size)
 
-    def fitted(rows: Sequence[FloatArray]) -> tuple[FloatArray, float]:
+    def left(rows: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
         columns = np.stack((*rows, constant), axis=1)
         factors = np.linalg.lstsq(columns, now, rcond=_ALIKE**1.5)[0]
-        return factors, float(np.sum((now - columns @ factors) ** 2))
+        return factors, now - columns @ factors
 
-    _, alone = fitted(own)
-    factors, left = fitted((*own, *seen))
-    if not alone > _ALIKE * now.size:
+    (_, alone), (factors, v) = left(own), left((*own, *seen))
+    if not alone @ alone > _ALIKE * now.size:
         return None
-    interval = record.mean_interval
-    w = 2.0 * math.pi * np.fft.rfftfreq(u.size, interval)[1:]
-    power = np.abs(np.fft.rfft(u * np.hanning(u.size))[1:]) ** 2
-    delay = np.exp(-1j * w * interval) ** np.arange(_PAST + 1)[:, None]
-    law = (factors[_PAST:-1] @ delay) / (1.0 - factors[:_PAST] @ delay[1:])
-    away = np.abs(1.0 - model(1j * w) * law * (u_size / y_size)) ** 2
-    alike = 1.0 - float(power @ np.minimum(away, 1.0)) / float(power.sum())
-    return (1.0 - left / alone) * alike
+    follows = 1.0 - float(v @ v) / float(alone @ alone)
+    w = 2.0 * math.pi * np.fft.rfftfreq(e.size, record.mean_interval)[1:]
+    delay = np.exp(-1j * w * record.mean_interval) ** np.arange(_PAST + 1)[:, None]
+    answer, rest = factors[_PAST:-1] @ delay, 1.0 - factors[:_PAST] @ delay[1:]
+
+    def power(x: FloatArray) -> FloatArray:
+        return np.asarray(np.abs(np.fft.rfft((x - x.mean()) * np.hanning(x.size))[1:]) ** 2)
+
+    def near(x: FloatArray) -> FloatArray:
+        return np.convolve(x, np.ones(_NEAR), "same")
+
+    weight = power(now)
+    # Of a law without noise both are zero, to rounding.
+    floor = _ALIKE**2 * near(np.abs(rest) ** 2 * weight)
+    inner, outer = floor + near(np.abs(answer) ** 2 * power(e)), floor + near(power(v))
+    share = np.minimum(inner / outer, 1.0)
+    away = np.abs(1.0 - model(1j * w) * answer / rest * (u_size / y_size)) ** 2
+    backward = float(weight @ (share * np.maximum(1.0 - away, 0.0))) / float(weight.sum())
+    return min(follows, backward)
 
 
 def unequal_amplitudes(records: Sequence[Record], model: TransferFunction) -> str | None:

@@ -19,6 +19,7 @@ from relay_autotune.identification.judgement.assessment import unexplained_share
 from relay_autotune.identification.judgement.checks import read_backward
 from relay_autotune.identification.judgement.difference import LEAST_SAMPLES
 from relay_autotune.identification.judgement.evidence import Evidence
+from relay_autotune.process.response import response
 from relay_autotune.record.cycles import limit_cycle
 from relay_autotune.record.excitation import MOST_GROWTH
 from relay_autotune.text import digits
@@ -35,7 +36,14 @@ _LIKELY_BAD = 0.5
 
 
 def _fed_back(evidence: Evidence) -> Measured | None:
-    share = read_backward(evidence.record, evidence.found.model)
+    found, record = evidence.found, evidence.record
+    fitted = found.fitted
+    if len(fitted) != len(record):
+        # A method that looks at cycles alone, as of a relay.
+        if found.model.grows:
+            return None
+        fitted = response(found.model, record.time, record.input())
+    share = read_backward(record, found.model, fitted)
     return None if share is None else Measured(share)
 
 
@@ -170,8 +178,8 @@ MODEL_CHECKS = (
     Check(
         name="fed_back",
         title="Feedback",
-        what="share of the command's changes that the measurement explains at once, times the "
-        "share of the command's power on which the model is the inverse of that law",
+        what="part of the command's power on which the model is the inverse of its controller's "
+        "law, by how far noise and loads outweigh there what came from outside",
         unit="",
         failed=0.5,
         sentence="the command follows the measurement, and {value} of the model is that "
