@@ -222,8 +222,9 @@ class FitContext:
             # A relay of the wrong direction oscillates on the first answer of an inverse response.
             if not any(-_LASTING * self.length < z.real < 0.0 for z in model.zeros):
                 return None
-        elif model.dead_time > self.latest[model.process_sign > 0]:
-            return None
+        elif model.dead_time > (latest := self.latest[model.process_sign > 0]):
+            # The measurement had moved by then, whatever else a fit would explain so.
+            return self.near(replace(problem, latest=latest), state)
         if model.growth_in(1.0) > self.most_growth:
             return None
         if self._impossible(problem, state):
