@@ -221,8 +221,8 @@ MODEL_CHECKS = (
         doubtful=0.1,
         failed=0.5,
         sentence="{value} of the measurement's variance is not explained",
-        remedy="keep other inputs constant, see that the actuator reaches its commands, or use a "
-        "larger amplitude",
+        remedy="keep other inputs constant, see that the actuator reaches its commands, use a "
+        "larger amplitude, or --loss tukey where a sensor dropped out",
         measure=_share,
     ),
     Check(

@@ -128,8 +128,8 @@ class NoResponseError(IdentificationError):
         super().__init__(
             f"the measurement shows no response{of} to the command beyond its noise and a slow "
             f"disturbance: {first}record from a rest on, raise the amplitude, move the command "
-            "more often, leave out parts in which something else acts, and check that both topics "
-            "belong to one loop"
+            "more often, leave out parts in which something else acts, with --loss tukey where a "
+            "sensor dropped out, and check that both topics belong to one loop"
         )
 
 
