@@ -149,6 +149,17 @@ def changes_within(u: Input, time: FloatArray) -> FloatArray:
     return np.asarray(u.times[(u.times >= time[0]) & (u.times < time[-1])])
 
 
+def only_move(u: PiecewiseConstant, time: FloatArray) -> float | None:
+    """Return when an input changes, if it does so once between the first and the last sample [s].
+
+    :param u: the input.
+    :param time: of the samples [s], shape (n,).
+    """
+    changes = changes_within(u, time)
+    moves = changes[np.diff(u.levels)[np.isin(u.times, changes)] != 0.0]
+    return float(moves[0]) if moves.size == 1 else None
+
+
 def longest_stay(time: FloatArray, u: Input) -> float:
     """Return the longest time between samples for which an input stood still [s].
 

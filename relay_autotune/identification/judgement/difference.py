@@ -34,7 +34,7 @@ from relay_autotune.identification.waveform.residuals import Colour, colour_cost
 from relay_autotune.identification.waveform.separable import left_of
 from relay_autotune.process.model_set import ModelErrors
 from relay_autotune.process.response import response
-from relay_autotune.record.excitation import changes_within
+from relay_autotune.record.excitation import only_move
 from relay_autotune.record.record import PiecewiseConstant, Record
 
 _BINS = 48
@@ -193,10 +193,9 @@ def _difference(found: Identification, record: Record) -> Difference | None:
     unexplained = max(noise - record.noise**2, 0.0) / max(total, 1e-300)
     lowest = 1.0 / record.duration
     late, share = np.zeros(edges.size - 1), 0.0
-    moves, at = changes_within(u, time), time[known]
-    sizes = np.diff(u.levels)[np.isin(u.times, moves)]
-    if len(beside) == 3 and np.count_nonzero(sizes) == 1:
-        (begin,), (size,), curve = moves[sizes != 0.0], sizes[sizes != 0.0], nuisances[2, known]
+    begin, at = only_move(u, time), time[known]
+    if len(beside) == 3 and begin is not None:
+        curve, size = nuisances[2, known], np.diff(u.levels)[u.times == begin]
         curve = np.where(at < begin, 0.0, curve - np.interp(begin, at, curve))
         response_too = np.vstack((nuisances[:2, known], curve))
         other = _posterior(left[known], response_too, moved, prior)

@@ -45,7 +45,7 @@ from relay_autotune.identification.waveform.separable import (
 )
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.record.excitation import changes_within
+from relay_autotune.record.excitation import only_move
 from relay_autotune.record.record import Record
 
 _UNEXPLAINED = 1.5
@@ -337,7 +337,7 @@ def _warnings(
         )
     if fit.problem.load is not None:
         size = fit.problem.relative("load", fit.state.coefficients)
-        once = changes_within(fit.problem.inputs[0], fit.problem.time).size == 1
+        once = only_move(records[0].input(), records[0].time) is not None
         found.append(
             f"a load step of {size:.3g} u at {fit.problem.load:.4g} s was estimated with the "
             "model, since no model fits the record as well without one"
