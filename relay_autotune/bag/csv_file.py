@@ -546,7 +546,8 @@ def _named(path: Path, names: Sequence[str], wanted: str) -> int:
         )
     if not fits:
         known = {without_unit(name).casefold(): name for name in names}
-        near = difflib.get_close_matches(wanted.casefold(), known, n=1)
+        within = (name for name in known if wanted.casefold() in name)
+        near = [*difflib.get_close_matches(wanted.casefold(), known, n=1), *within]
         meant = f"; did you mean {known[near[0]]!r}?" if near else ""
         raise NotThereError(
             f"{path} has no column {wanted!r}{meant}", f"its columns are {listed(names)}"

@@ -113,11 +113,13 @@ def without_unit(name: str) -> str:
 def unit_in(name: str) -> str:
     """Return the unit at the end of a name; empty: it has none.
 
-    >>> unit_in("Out (%)"), unit_in("PIC7_CV_pct"), unit_in("T3 degC"), unit_in("Pump 2")
-    ('%', '%', 'degC', '')
+    >>> unit_in("PIC7_CV_pct"), unit_in("T3 degC"), unit_in("TI4 [DEG F]"), unit_in("Pump 2")
+    ('%', 'degC', 'degF', '')
     """
     match = _BRACKETS.search(name) or _BARE.search(name)
     unit = match["unit"] if match else ""
+    # A unit that stands in a number's place is one word.
+    unit = re.sub(r"(?i)^deg +([cfk])$", lambda degree: f"deg{degree[1].upper()}", unit)
     return "%" if unit.lower() in _PERCENT else unit
 
 

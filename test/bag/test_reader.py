@@ -675,8 +675,9 @@ def test_one_function_reads_columns_of_a_bag_and_of_a_text():
     np.testing.assert_array_equal(read(text, [u])[u].values, columns[u].values)
     with pytest.raises(SelectionError, match="has no column 'nothing'"):
         read(text, ["nothing"])
-    with pytest.raises(SelectionError, match=re.escape(f"did you mean {y!r}?")):
-        read(text, ["temperature"])
+    for meant in ("temperature", y[4:9]):
+        with pytest.raises(SelectionError, match=re.escape(f"did you mean {y!r}?")):
+            read(text, [meant])
 
 
 @pytest.mark.parametrize("given", [None, 3, [], [None], b"log.csv"])
