@@ -49,7 +49,7 @@ from relay_autotune.loop.stability import (
 from relay_autotune.process.frequencies import frequencies
 from relay_autotune.process.model_set import ModelSet
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.text import digits
+from relay_autotune.text import digits, percent
 
 _POINTS = 4096
 _MOST_POINTS = 1 << 18
@@ -451,8 +451,8 @@ def performance_beside(
         return None
 
 
-# Factors of the error and of Ms that are worth a word.
-_ERROR, _MS = 1.05, 1.02
+# Factors of the error and of Ms that are worth a word, and how much more overshoot is.
+_ERROR, _MS, _OVERSHOOT = 1.05, 1.02, 0.05
 
 
 def lasting_error(gains: Controller, model: TransferFunction) -> float:
@@ -501,8 +501,13 @@ def difference(
     good = -1 if after > _ERROR * before else int(after * _ERROR < before)
     joined = "but" if calm * good < 0 else "and"
     more = "; where the present loop is calm enough, ask for faster ones with a larger ms"
+    beyond = (
+        f"; the overshoot after one of the set-point is {percent(new.overshoot)} instead of "
+        f"{percent(does.overshoot)} %: a smaller mt lowers it"
+    )
     return (
         f"the new gains are {('less calm', 'as calm', 'calmer')[calm + 1]} {joined} "
         f"{kinds[good + 1]}: Ms {new.ms:.3g} instead of {does.ms:.3g}, {errors} after a step of "
         f"the load{more * (good < 0 < calm and not lasts)}"
+        f"{beyond * (new.overshoot > does.overshoot + _OVERSHOOT)}"
     )

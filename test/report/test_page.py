@@ -420,6 +420,11 @@ def test_what_new_gains_change_is_said_in_words() -> None:
         assert told.startswith(f"the new gains are {words}: Ms {new.ms:.3g} instead of ")
         assert f", {1.0 / iae:.2f} times the error" in told
         assert ("ask for faster ones" in told) == (words == "calmer but slower")
+        assert "overshoot" not in told
+    told = difference(
+        present, replace(present, overshoot=0.02), replace(new, overshoot=0.2), MODEL
+    )
+    assert told.endswith("of the set-point is 20 instead of 2.0 %: a smaller mt lowers it")
 
 
 @pytest.mark.parametrize("model", [MODEL, TransferFunction(0.2, (), (), 1, 1.0)], ids=str)
