@@ -451,6 +451,16 @@ class Record:
         return own and bool(np.array_equal(self.command_time, self.time))
 
     @property
+    def is_of_changes(self) -> bool:
+        """True if each row of a table was written when one of its values changed.
+
+        There the measurement moves by less in each row that the command made than in any other.
+        """
+        moved, by = np.diff(self.command) != 0.0, np.abs(np.diff(self.measurement))
+        some = self.is_table and bool(np.any(moved)) and not np.all(moved)
+        return some and bool(by[moved].max() < by[~moved].min())
+
+    @property
     @cached_on_record
     def noise(self) -> float:
         """The noise measured before the test, or else estimated from second differences [y]."""

@@ -103,7 +103,9 @@ def _unseen(record: Record) -> float:
     moved = np.flatnonzero(np.diff(record.command))
     if not record.is_table or not moved.size:
         return 0.0
-    # In a log of changes alone the row before may be long ago: the usual time counts.
+    if record.is_of_changes:
+        return sampling_period(record)
+    # Where rows were left out the row before may be long ago: the usual time counts.
     return min(float(np.median(np.diff(record.time)[moved])), record.interval)
 
 
@@ -150,6 +152,9 @@ def sampling_period(record: Record) -> float:
     """
     before = record.unthinned
     period = 0.0 if len(record) < 2 else record.interval if before is None else before.interval
+    if record.is_of_changes:
+        # Rows between were left out.
+        period = float(np.min(np.diff(record.time)))
     if period and not SHORTEST <= period <= LONGEST:
         raise IdentificationError(
             f"the samples are {period:.3g} s apart, expected {SHORTEST:g} to {LONGEST:g} s: check "

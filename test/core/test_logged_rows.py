@@ -99,3 +99,22 @@ def test_rows_that_are_close_against_the_dead_time_are_told_nothing_of_it():
     found = analyse(_logged(2.0, (600.0, 2220.0, 3900.0)), rule="robust", alone=True)
     assert not any("before its row" in warning for warning in found.model.warnings)
     assert _true_ms(found.best_gains) < 1.5
+
+
+def test_an_archive_of_changes_tells_when_the_command_moved():
+    """Rows come where the measurement has moved by a band, or the command."""
+    every = _logged(2.0, (600.0, 2240.0, 3906.0))
+    y, u = every.measurement, every.command
+    kept = [0]
+    for i in range(1, y.size):
+        if abs(y[i] - y[kept[-1]]) >= 0.2 or u[i] != u[kept[-1]]:
+            kept.append(i)
+    record = Record(time=every.time[kept], measurement=y[kept], command=u[kept])
+    assert record.is_of_changes
+    assert not every.is_of_changes
+    found = analyse(record, rule="robust", alone=True)
+    assert found.verdict.name == "TRUSTED"
+    assert 1.2 < _true_ms(found.best_gains) < 1.5
+    # The usual time between rows is that of a rest, and several times as long.
+    assert record.interval >= 8.0
+    assert "for a controller that runs every 2 s" in found.best_gains.reason
