@@ -51,6 +51,8 @@ _REGULAR = 1.5
 _SATURATED = 20
 _AWAY, _CROSSED = 0.04, 0.2
 _MOST_FOR_SPEED = 2000
+# Ratio of a sensor's jumps to the largest of all smaller moves from sample to sample.
+_APART = 2.0
 
 # The measurement moves if it leaves its rest by this many standard deviations of its noise, and by
 # a share of its range.
@@ -271,6 +273,31 @@ def at_its_ends(y: FloatArray, band: float = 0.0) -> list[tuple[int, int, float]
         for begin, stop, end in sorted(runs)
         if np.any(np.abs(y[max(begin - 2 * few * step, 0) : begin] - end) > away)
     ]
+
+
+def jumped_away(y: FloatArray, share: float) -> NDArray[np.bool_]:
+    """Return at which samples a measurement is away from where it jumped from, shape (n,).
+
+    A sensor that drops out jumps by more than a process moves between any two samples, and jumps
+    back, unless the record ends before. It was there at more than half of the samples.
+
+    :param y: the measurement [y], shape (n,), n >= 2.
+    :param share: largest share of the samples that are away; of more, none is.
+    """
+    steps, away = np.diff(y), np.zeros(y.size, dtype=np.bool_)
+    size = np.sort(np.abs(steps))[::-1][: 2 * int(share * y.size) + 1]
+    stands_out = (size[:-1] > _APART * size[1:]) & (size[1:] > 0.0)
+    if not np.any(stands_out):
+        return away
+    least, begin, level = size[np.argmax(stands_out)], 0, 0.0
+    for i in (np.flatnonzero(np.abs(steps) >= least) + 1).tolist():
+        begin, level = (begin, level + steps[i - 1]) if begin else (i, steps[i - 1])
+        if abs(level) < 0.5 * least:
+            away[begin:i], begin = True, 0
+    if begin:
+        away[begin:] = True
+    away ^= away.mean() > 0.5
+    return away & (away.mean() <= share)
 
 
 def _saturated(y: FloatArray) -> NDArray[np.bool_]:

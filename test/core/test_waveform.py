@@ -444,7 +444,37 @@ def test_a_jump_in_the_last_samples_is_left_out():
     found = identify_waveform(Record(time, y, command), FOPDT)
     assert found.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.03)
     assert found.fit.residual_rms < 0.03
-    assert any("the last" in w and "were left out" in w for w in found.warnings)
+    assert any("15 of the samples, the first at 292.5 s" in w for w in found.warnings)
+
+
+@pytest.mark.parametrize(
+    "dropped", [[(0, 12)], [(500, 504)], [(500, 540)], [(90, 93), (400, 411), (690, 700)]]
+)
+def test_a_sensor_that_drops_out_is_left_out(dropped):
+    rng = np.random.default_rng(3)
+    time = np.arange(0.0, 435.0, 0.5)
+    command = 10.0 * np.array([0, 0, 1, 2, 1, 0, -1, 0])[(time // 55.0).astype(int)]
+    process = TransferFunction.sopdt(1.0, (10.0, 4.0), 3.0)
+    u = PiecewiseConstant.from_samples(time, command)
+    y = 40.0 + response(process, time, u) + rng.normal(0.0, 0.1, time.size)
+    known = Known(structure="sopdt")
+    clean = identify_waveform(Record(time, y, command), known)
+    for begin, stop in dropped:
+        y[begin:stop] = 0.0
+    found = identify_waveform(Record(time, y, command), known)
+    assert found.ultimate_gain == pytest.approx(clean.ultimate_gain, rel=0.005)
+    left_out = sum(stop - begin for begin, stop in dropped)
+    assert any(f"{left_out} of the samples, the first at" in w for w in found.warnings)
+
+
+def test_a_fast_process_that_answers_a_pulse_is_no_sensor_that_drops_out():
+    time = np.arange(0.0, 100.0, 0.5)
+    u = PiecewiseConstant(np.array([40.0, 45.0]), np.array([1.0, 0.0]), 0.0)
+    process = TransferFunction.fopdt(30.0, 0.2, 2.0)
+    y = response(process, time, u) + np.random.default_rng(4).normal(0.0, 0.05, time.size)
+    found = identify_waveform(Record(time, y, u(time), held_input=u), FOPDT)
+    assert found.model.gain == pytest.approx(30.0, rel=0.01)
+    assert not any("left out" in w for w in found.warnings)
 
 
 @pytest.mark.parametrize(("late", "hides"), [(4.5, True), (1.0, False)])

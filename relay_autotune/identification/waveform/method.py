@@ -15,10 +15,11 @@ drift and initial state.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.waveform.candidates import MANY
+from relay_autotune.identification.waveform.candidates import MANY, as_in
 from relay_autotune.identification.waveform.choice import (
     ANSWERED,
     SIMPLE,
@@ -63,7 +64,13 @@ from relay_autotune.identification.waveform.separable import (
 from relay_autotune.identification.waveform.starts import is_controlled
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, TABLE
-from relay_autotune.record.excitation import at_its_ends, changes_within, runs_of, smooth
+from relay_autotune.record.excitation import (
+    at_its_ends,
+    changes_within,
+    jumped_away,
+    runs_of,
+    smooth,
+)
 from relay_autotune.record.record import Input, PiecewiseConstant, Record, roughness
 from relay_autotune.text import counted, digits
 
@@ -77,9 +84,6 @@ _MOST_SAMPLES = 2_000_000
 # Standard deviations of a spike, the most samples of one, and the largest share of all: of data
 # as they come 1 to 10 % are gross errors (Hampel, Ronchetti, Rousseeuw and Stahel 1986).
 _OUTLIER, _SPIKE, _MOST_OUTLIERS = 6.0, 3, 0.1
-# Largest share of the samples after a jump near the end that are left out, and the ratio by which
-# that divides the mean square of the residual.
-_MOST_LATE, _DIVIDED = 0.05, 0.5
 # Distance from the end of its range within which the mean of a few samples stays there, in
 # standard deviations of the noise and as a share of the range; samples that show whether the model
 # moves on.
@@ -126,7 +130,7 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
     for record, u in zip(records, inputs, strict=True):
         _require_content(record, u)
     # In units of its own range, so that no unit of measurement is too large or too small.
-    scale = max(max(float(np.ptp(y)), float(np.abs(y).max()) * 1e-6) for y in _measured(records))
+    scale = max(max(float(np.ptp(y)), float(np.abs(y).max()) * 1e-6) for y in _there(records))
     problem = problem_of(
         [
             (record.time, (record.measurement - record.measurement[0]) / scale, u)
@@ -175,6 +179,11 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
     def chosen(samples: Problem, among: Sequence[str] = TRIED, before: Fit | None = None) -> Fit:
         return chosen_fit(samples, known, sign, scale, held=held, among=among, before=before)
 
+    @cache
+    def first(samples: Problem) -> Fit:
+        return chosen(samples)
+
+    problem, dropped = _beside_dropouts(problem, first)
     stopped = ""
     if not sign and len(problem.bounds) == 1:
         # Under a relay it turns around.
@@ -182,7 +191,7 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
 
     def searched(samples: Problem) -> tuple[float, Fit | None]:
         try:
-            fit = _by_noise(samples, chosen(samples), chosen)
+            fit = _by_noise(samples, first(samples), chosen)
             fit = _spared_of_outliers(samples, fit, known, chosen)
         except NoResponseError:
             return -math.inf, None
@@ -205,7 +214,7 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
             "recorded late and hides the dead time: record it when it is sent, on the clock of "
             "the measurement"
         )
-    return replace(fit, warnings=(*fit.warnings, stopped)) if stopped else fit
+    return replace(fit, warnings=(*fit.warnings, *filter(None, (dropped, stopped))))
 
 
 def _moves_often(time: FloatArray, u: Input) -> bool:
@@ -272,22 +281,73 @@ def _is_stop(problem: Problem, begin: int, before: Fit, chosen: Choose) -> bool:
     :param chosen: fits samples.
     """
     try:
-        fits = before, chosen(problem.thinned(_FEW), SIMPLE)
+        whole = chosen(problem.thinned(_FEW), SIMPLE)
     except NoResponseError:
         return True
-    if fits[1].problem.load is not None:
-        # A load that comes just there is no process that goes on.
-        return True
-    moves, goes_on = map(mean_square_left, fits)
-    n, stays = problem.y.size, float(np.var(problem.y[begin:]))
-    floor, stopped = n * NEGLIGIBLE**2, begin * moves + (n - begin) * stays
-    gained = information_criterion(n * goes_on, n, 0, floor)
-    # The constant and its instant are estimated.
-    return gained - information_criterion(stopped, n, 2, floor) > ANSWERED
+    # A load that comes just there is no process that goes on.
+    away = np.arange(problem.y.size) >= begin
+    return whole.problem.load is not None or _is_apart(problem, before, whole, away)
 
 
-def _measured(records: Sequence[Record]) -> list[FloatArray]:
-    return [record.measurement for record in records]
+def _is_apart(problem: Problem, rest: Fit, whole: Fit, away: NDArray[np.bool_]) -> bool:
+    """Return whether samples with a level of their own explain more than a process does.
+
+    :param problem: all samples.
+    :param rest: a fit of some of the others.
+    :param whole: a fit of some of all.
+    :param away: which samples these are, shape (n,).
+    """
+    n, floor = away.size, away.size * NEGLIGIBLE**2
+    runs = runs_of(away)
+    apart = float(np.sum(~away)) * _left_of(rest, problem.part(~away))
+    apart += sum((stop - begin) * float(np.var(problem.y[begin:stop])) for begin, stop in runs)
+    # Each level and its first and last instants are estimated; the last may be the record's.
+    parameters = 3 * len(runs) - int(away[-1])
+    gained = information_criterion(n * _left_of(whole, problem), n, 0, floor)
+    return gained - information_criterion(apart, n, parameters, floor) > ANSWERED
+
+
+def _left_of(fit: Fit, problem: Problem) -> float:
+    """Return the mean square that a model leaves of samples."""
+    return mean_square_left(replace(fit, problem=as_in(fit.problem, problem)))
+
+
+def _beside_dropouts(problem: Problem, chosen: Callable[[Problem], Fit]) -> tuple[Problem, str]:
+    """Return the samples without those of a sensor that dropped out, and a warning.
+
+    What jumps may be a fast process, whose best model then explains the jumps.
+
+    :param problem: all samples.
+    :param chosen: fits samples with the best of all structures.
+    """
+    away = jumped_away(problem.y, _MOST_OUTLIERS)
+    if len(problem.bounds) > 1 or not np.any(away):
+        return problem, ""
+    back = problem.time[: int(np.argmin(away)) + 1]
+    if away[0] and changes_within(problem.inputs[0], back).size:
+        # It may as well be the answer to a command that ends a rest.
+        return problem, ""
+    there = problem.part(~away)
+    try:
+        rest = chosen(there)
+    except NoResponseError:
+        return problem, ""
+    with contextlib.suppress(NoResponseError):
+        whole = chosen(problem)
+        if not _is_apart(problem, rest, whole, away):
+            return problem, ""
+    warning = (
+        f"{int(away.sum())} of the samples, the first at {problem.time[np.argmax(away)]:.4g} s, "
+        "lie beyond a jump that no process makes, and were left out: check the sensor for dropouts"
+    )
+    # Smaller jumps stand out once the largest are left out.
+    there, more = _beside_dropouts(there, chosen)
+    return there, "; ".join(filter(None, (warning, more)))
+
+
+def _there(records: Sequence[Record]) -> list[FloatArray]:
+    """Return what each record measures where its sensor has not dropped out."""
+    return [y[~jumped_away(y, _MOST_OUTLIERS)] for y in (r.measurement for r in records)]
 
 
 def _sign(records: Sequence[Record]) -> int:
@@ -349,15 +409,6 @@ def _spared_of_outliers(problem: Problem, fit: Fit, known: Known, chosen: Choose
         weight[_places(problem, first.problem)] = first.problem.weight
         again = chosen(replace(problem, weight=weight))
         return _counted(_reweighted(problem, again, known.loss, base))
-    kept = _before_jump(problem, fit)
-    if kept < problem.time.size:
-        last = problem.time[kept]
-        jumped = (
-            f"from {last:.4g} s on, the last {problem.time.size - kept} samples lie far off what "
-            "explains all before them, and were left out: look at what happened there"
-        )
-        problem = problem.part(slice(None, kept))
-        fit = replace(chosen(problem), warnings=(jumped,))
     outlying = _outliers(problem, fit.problem, fit.state)
     if not np.any(outlying):
         return fit
@@ -400,26 +451,6 @@ def _counted(fit: Fit) -> Fit:
 def _places(whole: Problem, part: Problem) -> NDArray[np.int64]:
     """Return where the samples of a part are among those of the whole."""
     return np.searchsorted(whole.index, part.index)
-
-
-def _before_jump(whole: Problem, fit: Fit) -> int:
-    """Return how many samples come before a jump near the end that no model explains.
-
-    A step of a sensor, or a hand on the process, in the last samples would spoil all before it.
-
-    :param whole: all samples.
-    :param fit: the fit of some of them.
-    """
-    problem = replace(fit.problem, colour=None, weight=None)
-    square = np.cumsum(raw_residual(problem, fit.state) ** 2)
-    n = square.size
-    mean = square / np.arange(1, n + 1)
-    first = int((1.0 - _MOST_LATE) * n)
-    kept = first + int(np.argmin(mean[first:])) + 1
-    left = max(float(mean[kept - 1]), NEGLIGIBLE**2)
-    if len(problem.bounds) > 1 or kept == n or left > _DIVIDED * mean[-1]:
-        return whole.time.size
-    return int(np.searchsorted(whole.index, problem.index[kept]))
 
 
 def _outliers(whole: Problem, problem: Problem, state: Trial) -> NDArray[np.bool_]:

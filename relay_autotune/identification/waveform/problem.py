@@ -36,7 +36,8 @@ _LEAST = 0.01
 _ONE_SIDE = 0.05
 
 
-@dataclass(frozen=True)
+# Its arrays have no equality of their own.
+@dataclass(frozen=True, eq=False)
 class Problem:
     """Samples, inputs and structure, with the terms that are estimated beside the model.
 
