@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +51,10 @@ _REGULAR = 1.5
 _SATURATED = 20
 _AWAY, _CROSSED = 0.04, 0.2
 _MOST_FOR_SPEED = 2000
-# Ratio of a sensor's jumps to the largest of all smaller moves from sample to sample.
-_APART = 2.0
+# Ratio of a sensor's jumps to the largest of all smaller moves from sample to sample, and the
+# largest share of the samples in which it is away: of data as they come 1 to 10 % are gross errors
+# (Hampel, Ronchetti, Rousseeuw and Stahel 1986).
+_APART, MOST_AWAY = 2.0, 0.1
 
 # The measurement moves if it leaves its rest by this many standard deviations of its noise, and by
 # a share of its range.
@@ -98,6 +100,10 @@ def find_experiments(record: Record) -> tuple[Stretch, ...]:
     :returns: the stretches; empty if the command does not move the measurement.
     """
     found: list[Stretch] = []
+    if np.any(away := jumped_away(record.measurement)):
+        # A sensor that drops out says nothing of where the process moves.
+        there = np.interp(record.time, record.time[~away], record.measurement[~away])
+        record = replace(record, measurement=there)
     for first, last in _unbroken(record):
         found += _in_part(record, first, last)
     return tuple(found)
@@ -275,17 +281,17 @@ def at_its_ends(y: FloatArray, band: float = 0.0) -> list[tuple[int, int, float]
     ]
 
 
-def jumped_away(y: FloatArray, share: float) -> NDArray[np.bool_]:
+def jumped_away(y: FloatArray) -> NDArray[np.bool_]:
     """Return at which samples a measurement is away from where it jumped from, shape (n,).
 
     A sensor that drops out jumps by more than a process moves between any two samples, and jumps
-    back, unless the record ends before. It was there at more than half of the samples.
+    back, unless the record ends before. Where more than a tenth of the samples would be away, none
+    is.
 
     :param y: the measurement [y], shape (n,), n >= 2.
-    :param share: largest share of the samples that are away; of more, none is.
     """
     steps, away = np.diff(y), np.zeros(y.size, dtype=np.bool_)
-    size = np.sort(np.abs(steps))[::-1][: 2 * int(share * y.size) + 1]
+    size = np.sort(np.abs(steps))[::-1][: 2 * int(MOST_AWAY * y.size) + 1]
     stands_out = (size[:-1] > _APART * size[1:]) & (size[1:] > 0.0)
     if not np.any(stands_out):
         return away
@@ -297,7 +303,7 @@ def jumped_away(y: FloatArray, share: float) -> NDArray[np.bool_]:
     if begin:
         away[begin:] = True
     away ^= away.mean() > 0.5
-    return away & (away.mean() <= share)
+    return away & (away.mean() <= MOST_AWAY)
 
 
 def _saturated(y: FloatArray) -> NDArray[np.bool_]:

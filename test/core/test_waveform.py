@@ -467,6 +467,22 @@ def test_a_sensor_that_drops_out_is_left_out(dropped):
     assert any(f"{left_out} of the samples, the first at" in w for w in found.warnings)
 
 
+def test_where_a_coarse_sensor_drops_out_nothing_is_fitted():
+    """What the model leaves there would count as what it does not explain."""
+    rng = np.random.default_rng(2)
+    time = np.arange(0.0, 400.0, 0.5)
+    u = PiecewiseConstant(np.array([50.0, 150.0, 250.0]), np.array([10.0, 20.0, 5.0]), 0.0)
+    process = TransferFunction.sopdt(1.0, (20.0, 4.0), 3.0)
+    y = 60.0 + response(process, time, u) + rng.normal(0.0, 0.02, time.size)
+    y = np.round(y)
+    y[400:410] = 0.0
+    found = identify_waveform(Record(time, y, u(time), held_input=u), FOPDT)
+    assert any("autoregression" in w for w in found.warnings)
+    left_out = np.flatnonzero(np.isnan(found.fitted))
+    assert set(range(400, 410)) <= set(left_out)
+    assert left_out.size < 20
+
+
 def test_a_fast_process_that_answers_a_pulse_is_no_sensor_that_drops_out():
     time = np.arange(0.0, 100.0, 0.5)
     u = PiecewiseConstant(np.array([40.0, 45.0]), np.array([1.0, 0.0]), 0.0)

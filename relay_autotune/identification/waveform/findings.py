@@ -184,7 +184,8 @@ def _fitted(records: Sequence[Record], fit: Fit, residual: FloatArray) -> FloatA
     thinned = problem.colour is not None or 2 * problem.time.size <= len(record)
     if thinned and len(records) == 1:
         # It was fitted to some of the samples only. Free motion and drift begin with the first.
-        step = int(np.max(np.diff(problem.index), initial=1))
+        apart = np.diff(problem.index)
+        step = int(np.min(apart))
         part = slice(int(problem.index[0]), int(problem.index[-1]) + step)
         time = record.time[part]
         every = replace(
@@ -197,7 +198,9 @@ def _fitted(records: Sequence[Record], fit: Fit, residual: FloatArray) -> FloatA
         )
         answer = fit.state.coefficients @ every.columns(fit.state.theta)
         fitted[part] = record.measurement[0] + scale * answer
-        return np.asarray(fitted)
+        for last in np.flatnonzero(apart > step):
+            fitted[problem.index[last] + 1 : problem.index[last + 1]] = math.nan
+        return fitted
     own = problem.index < len(record)
     used = problem.index[own]
     fitted[used] = record.measurement[used] - scale * residual[own]

@@ -65,6 +65,7 @@ from relay_autotune.identification.waveform.starts import is_controlled
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, TABLE
 from relay_autotune.record.excitation import (
+    MOST_AWAY,
     at_its_ends,
     changes_within,
     jumped_away,
@@ -81,9 +82,8 @@ _ENOUGH_FOR_TWO, _EXCHANGED = 20, 4.0
 _LEAST_SAMPLES = 12
 # Largest number of samples that are fitted: beyond, noise does not limit what is known.
 _MOST_SAMPLES = 2_000_000
-# Standard deviations of a spike, the most samples of one, and the largest share of all: of data
-# as they come 1 to 10 % are gross errors (Hampel, Ronchetti, Rousseeuw and Stahel 1986).
-_OUTLIER, _SPIKE, _MOST_OUTLIERS = 6.0, 3, 0.1
+# Standard deviations of a spike, and the most samples of one.
+_OUTLIER, _SPIKE = 6.0, 3
 # Distance from the end of its range within which the mean of a few samples stays there, in
 # standard deviations of the noise and as a share of the range; samples that show whether the model
 # moves on.
@@ -320,7 +320,7 @@ def _beside_dropouts(problem: Problem, chosen: Callable[[Problem], Fit]) -> tupl
     :param problem: all samples.
     :param chosen: fits samples with the best of all structures.
     """
-    away = jumped_away(problem.y, _MOST_OUTLIERS)
+    away = jumped_away(problem.y)
     if len(problem.bounds) > 1 or not np.any(away):
         return problem, ""
     back = problem.time[: int(np.argmin(away)) + 1]
@@ -347,7 +347,7 @@ def _beside_dropouts(problem: Problem, chosen: Callable[[Problem], Fit]) -> tupl
 
 def _there(records: Sequence[Record]) -> list[FloatArray]:
     """Return what each record measures where its sensor has not dropped out."""
-    return [y[~jumped_away(y, _MOST_OUTLIERS)] for y in (r.measurement for r in records)]
+    return [y[~jumped_away(y)] for y in (r.measurement for r in records)]
 
 
 def _sign(records: Sequence[Record]) -> int:
@@ -467,7 +467,7 @@ def _outliers(whole: Problem, problem: Problem, state: Trial) -> NDArray[np.bool
     # A coarse sensor is now and then a step off, however narrow the bulk of its errors is.
     most = max(_OUTLIER * width + quantisation_step(whole.y), NEGLIGIBLE)
     far = np.abs(error - middle) > most
-    if not (width > NEGLIGIBLE and 0.0 < far.mean() <= _MOST_OUTLIERS):
+    if not (width > NEGLIGIBLE and 0.0 < far.mean() <= MOST_AWAY):
         return found
     # Where more are in a row, or a line between their neighbours misses the model as well, there
     # is something that the model lacks.
