@@ -246,7 +246,8 @@ class FitContext:
         possible = {
             # Commands may lose their effect on one side, but not act the other way there.
             "unequal": min(problem.effects(found)) >= 0.0,
-            "ends": low < high,
+            "ends": problem.ends is None
+            or (high - low >= least and (math.isfinite(low) or math.isfinite(high))),
             "friction": not problem.friction or problem.dry_friction(found) >= least,
             "play": not problem.play or least <= problem.play_of(found) <= most,
         }
