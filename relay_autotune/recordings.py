@@ -256,6 +256,9 @@ def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
         try:
             command = preceded(log.command, wanted.command_before)
             record = _in_units(join(log.measurement, command, dated=log.dated), log.units)
+            if len(log.command) != len(log.measurement):
+                unseen = max(record.unseen, _between_readings(log.command))
+                record = replace(record, unseen=unseen)
             found, said = _taken_apart(record, whole=wanted.is_part)
         except BagError as fault:
             faults.append(fault)
@@ -265,6 +268,14 @@ def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
     if not records:
         raise faults[0]
     return records, [*notes, *(f"one of the recordings is left out: {f}" for f in faults)]
+
+
+def _between_readings(command: Signal) -> float:
+    """Return the time between readings of a command [s]; 0: it was written where it changed."""
+    moves, gaps = np.diff(command.values), np.diff(command.time_ns) / 1e9
+    if np.all(moves):
+        return 0.0
+    return min(float(np.median(gaps)), float(np.median(gaps[moves != 0.0])))
 
 
 def _in_units(record: Record, units: Mapping[str, str]) -> Record:

@@ -291,7 +291,8 @@ def jumped_away(y: FloatArray) -> NDArray[np.bool_]:
     :param y: the measurement [y], shape (n,), n >= 2.
     """
     steps, away = np.diff(y), np.zeros(y.size, dtype=np.bool_)
-    size = np.sort(np.abs(steps))[::-1][: 2 * int(MOST_AWAY * y.size) + 1]
+    few = min(2 * int(MOST_AWAY * y.size) + 1, steps.size)
+    size = np.sort(np.partition(np.abs(steps), -few)[-few:])[::-1]
     stands_out = (size[:-1] > _APART * size[1:]) & (size[1:] > 0.0)
     if not np.any(stands_out):
         return away

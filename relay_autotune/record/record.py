@@ -347,6 +347,8 @@ class Record:
         follows from ``command`` and ``command_time``.
     :param continuous_command: True: the command moved along straight lines between its instants,
         as from an analogue controller; False: it was held.
+    :param unseen: how long before its instant a change of the command may have come [s]; NaN: the
+        time between rows in a table, else 0.
     :param unthinned: what it was before it was thinned; None: it was not.
     :param units: of the measurement, by "y", and of the command, by "u", as far as known.
     :ivar answers: answers that the record remembers, see :func:`cached_on_record`.
@@ -370,6 +372,7 @@ class Record:
     lost_samples: int = 0
     held_input: PiecewiseConstant | None = None
     continuous_command: bool = False
+    unseen: float = math.nan
     unthinned: Unthinned | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     answers: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
@@ -409,6 +412,8 @@ class Record:
                 f"cycle_start must hold increasing sample numbers below {n}, found {starts}"
             )
         object.__setattr__(self, "cycle_start", starts)
+        if math.isnan(self.unseen):
+            object.__setattr__(self, "unseen", self._between_rows())
         if self.noise_std < 0.0 or self.noise_std > LARGEST:
             raise RecordError(
                 f"noise_std of the record is {self.noise_std:g}, expected a number from 0 to "
@@ -450,14 +455,25 @@ class Record:
         own = self.settings is None and self.held_input is None and not self.continuous_command
         return own and bool(np.array_equal(self.command_time, self.time))
 
+    def _between_rows(self) -> float:
+        """Return the time between the rows of a table about changes of the command [s]; or 0."""
+        moved, gaps = np.flatnonzero(np.diff(self.command)), np.diff(self.time)
+        if not self.is_table or not moved.size:
+            return 0.0
+        # Where rows were left out the row before may be long ago: the usual time counts.
+        usual = float(np.median(gaps))
+        if self.is_of_changes:
+            return float(np.min(gaps[gaps > 0.0]))
+        return min(usual, float(np.median(gaps[moved])))
+
     @property
     def is_of_changes(self) -> bool:
-        """True if each row of a table was written when one of its values changed.
+        """True if each row was written when one of its values changed, as in an archive.
 
         There the measurement moves by less in each row that the command made than in any other.
         """
         moved, by = np.diff(self.command) != 0.0, np.abs(np.diff(self.measurement))
-        some = self.is_table and bool(np.any(moved)) and not np.all(moved)
+        some = bool(np.any(moved)) and not np.all(moved)
         return some and bool(by[moved].max() < by[~moved].min())
 
     @property

@@ -51,7 +51,7 @@ def task_of_record(
     models = ensemble(chosen, rng=rng)
     if beside is not None and not models:
         models = (chosen.model,) * DRAWS
-    unseen = _unseen(record)
+    unseen = record.unseen
     if unseen:
         options = replace(options, loop_delay=options.loop_delay + 0.5 * unseen)
         models = _spread_in_time(models, unseen, rng)
@@ -93,22 +93,6 @@ def _clock_of(record: Record) -> float:
     return float(f"{sampling_period(record):.3g}")
 
 
-def _unseen(record: Record) -> float:
-    """Return how long before its row a change of the command may have come [s]; 0: not at all.
-
-    The rows of a table do not tell whether the command was taken before or after its controller
-    moved it, or between two moves. Dead times found in it are too short by up to the time from
-    the row before to that of the change.
-    """
-    moved = np.flatnonzero(np.diff(record.command))
-    if not record.is_table or not moved.size:
-        return 0.0
-    if record.is_of_changes:
-        return sampling_period(record)
-    # Where rows were left out the row before may be long ago: the usual time counts.
-    return min(float(np.median(np.diff(record.time)[moved])), record.interval)
-
-
 def _spread_in_time(
     models: Sequence[TransferFunction], unseen: float, rng: np.random.Generator
 ) -> tuple[TransferFunction, ...]:
@@ -131,7 +115,7 @@ def warned_of_rows(chosen: Identification, record: Record) -> Identification:
     :param chosen: the model.
     :param record: the record.
     """
-    unseen = _unseen(record)
+    unseen = record.unseen
     later = replace(chosen.model, dead_time=chosen.model.dead_time + unseen)
     point = ultimate_point(later)
     if point is None or abs(point.gain) > _MUCH_LESS * abs(chosen.ultimate_gain):
@@ -152,9 +136,10 @@ def sampling_period(record: Record) -> float:
     """
     before = record.unthinned
     period = 0.0 if len(record) < 2 else record.interval if before is None else before.interval
-    if record.is_of_changes:
-        # Rows between were left out.
-        period = float(np.min(np.diff(record.time)))
+    if record.unseen and record.is_of_changes:
+        # Rows between were left out, but for those about changes of the command.
+        gaps = np.diff(record.time)[np.diff(record.command) == 0.0]
+        period = float(np.min(gaps[gaps > 0.0]))
     if period and not SHORTEST <= period <= LONGEST:
         raise IdentificationError(
             f"the samples are {period:.3g} s apart, expected {SHORTEST:g} to {LONGEST:g} s: check "

@@ -660,3 +660,26 @@ def test_a_counter_that_wraps_around_is_counted_on(tmp_path, header, begin, step
     (record,) = found.experiments
     np.testing.assert_allclose(record.time, np.arange(60) * step * unit, atol=1e-6)
     assert any("wraps around at" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("own_rows", [False, True])
+@pytest.mark.parametrize(
+    ("written", "unseen"),
+    # Each 10 s, whether it moved or not; and only where it moved.
+    [(lambda k, u: k % 10 == 0, 10.0), (lambda k, u: k == 0 or u(k) != u(k - 1), None)],
+)
+def test_a_command_that_is_read_seldom_may_have_moved_since_its_last_reading(
+    tmp_path, own_rows, written, unseen
+):
+    def u(k):
+        return (0, 10, 0, -10, 0, 10)[k // 83]
+
+    text = "time,y,u\n"
+    for k in range(480):
+        of = u(k) if written(k, u) else ""
+        y = 50 + u(max(k - 20, 0)) + k % 3
+        text += f"{k},{y},\n" + (f"{k}.3,,{of}\n" if of != "" else "") if own_rows else ""
+        text += "" if own_rows else f"{k},{y},{of}\n"
+    found = read_experiments(write(tmp_path / "a.csv", text), Selection("y", "u", "time"))
+    expected = unseen or (0.0 if own_rows else 1.0)
+    assert [record.unseen for record in found.experiments] == [expected]

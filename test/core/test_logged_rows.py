@@ -118,3 +118,8 @@ def test_an_archive_of_changes_tells_when_the_command_moved():
     # The usual time between rows is that of a rest, and several times as long.
     assert record.interval >= 8.0
     assert "for a controller that runs every 2 s" in found.best_gains.reason
+
+
+def test_a_part_of_a_table_tells_no_more_of_when_the_command_moved():
+    record = _in_loop(late=1)
+    assert record.unseen == record.part(40, len(record)).unseen == 1.0
