@@ -68,6 +68,9 @@ _FAR = 0.5
 _ENOUGH_REST = 15
 _STILL, _STILL_LATER = 0.05, 0.5
 
+# Least number of samples that show what a model lacks.
+LEAST_SAMPLES = 60
+
 # Number of time constants within which an unstable process leaves any rest.
 MOST_GROWTH = 7.0
 
@@ -546,6 +549,7 @@ def _with_rest(
     for k, (begin, end, kind, reason) in enumerate(found):
         # Rest shows noise and offset. It is short under a controller, which follows the noise.
         length = max(end - begin, 0.0) * (1.0 if kind in ("relay", "closed loop") else _REST)
+        length = max(length, LEAST_SAMPLES * record.interval)
         earliest = found[k - 1][1] if k else float(record.time[first])
         latest = found[k + 1][0] if k + 1 < len(found) else float(record.time[last])
         low = int(np.searchsorted(record.time, max(begin - length, earliest), side="left"))

@@ -15,7 +15,12 @@ from sampled_relay import simulate_sampled_relay
 from relay_autotune.analysis import analyse
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.excitation import find_experiments, gaps_of, resting_command
+from relay_autotune.record.excitation import (
+    LEAST_SAMPLES,
+    find_experiments,
+    gaps_of,
+    resting_command,
+)
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
@@ -242,6 +247,20 @@ def test_a_sensor_that_drops_out_hides_no_closed_loop(samples):
     spiked = replace(record, measurement=np.where(away, 100.0, y))
     assert find_experiments(spiked)[0].kind == "closed loop"
     assert spans(spiked) == spans(record)
+
+
+def test_a_closed_loop_keeps_as_many_samples_as_show_what_a_model_lacks():
+    """The measurement follows within a few samples, while the command moves on for long."""
+    time = np.arange(0.0, 9000.0, 30.0)
+    rng = np.random.default_rng(1)
+    levels = 5.0 + 3.0 * np.exp(-np.maximum(time - 600.0, 0.0) / 60.0) * (time >= 600.0)
+    levels += 0.01 * rng.standard_normal(time.size)
+    u = PiecewiseConstant(time, levels, 5.0)
+    y = 50.0 + (time >= 600.0) * (1.0 - np.exp(-np.maximum(time - 600.0, 0.0) / 60.0))
+    y += 0.01 * rng.standard_normal(time.size)
+    (found,) = find_experiments(Record(time, y, u(time), held_input=u))
+    assert found.kind == "closed loop"
+    assert found.last - found.first >= LEAST_SAMPLES
 
 
 def test_all_of_a_short_test_is_one_experiment():

@@ -34,12 +34,11 @@ from relay_autotune.identification.waveform.residuals import Colour, colour_cost
 from relay_autotune.identification.waveform.separable import left_of
 from relay_autotune.process.model_set import ModelErrors
 from relay_autotune.process.response import response
-from relay_autotune.record.excitation import only_move
+from relay_autotune.record.excitation import LEAST_SAMPLES, only_move
 from relay_autotune.record.record import PiecewiseConstant, Record
 
 _BINS = 48
 _MOST_COMPARED = 2000
-LEAST_SAMPLES = 60
 # Responses of the model in which the prior decays.
 _DECAY = 3.0
 # Ratios of the powers of difference and noise, of which the most likely one is taken.

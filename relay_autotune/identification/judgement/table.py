@@ -17,11 +17,10 @@ import numpy as np
 from relay_autotune.identification.estimate import student_95
 from relay_autotune.identification.judgement.assessment import unexplained_share
 from relay_autotune.identification.judgement.checks import read_backward
-from relay_autotune.identification.judgement.difference import LEAST_SAMPLES
 from relay_autotune.identification.judgement.evidence import Evidence
 from relay_autotune.process.response import response
 from relay_autotune.record.cycles import limit_cycle
-from relay_autotune.record.excitation import MOST_GROWTH
+from relay_autotune.record.excitation import LEAST_SAMPLES, MOST_GROWTH
 from relay_autotune.text import digits
 from relay_autotune.verdict import Check, Measured, not_known
 
