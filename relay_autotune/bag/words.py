@@ -118,7 +118,7 @@ def unit_in(name: str) -> str:
     """
     match = _BRACKETS.search(name) or _BARE.search(name)
     unit = match["unit"] if match else ""
-    # A unit that stands in a number's place is one word.
+    # Units are shown as one word each.
     unit = re.sub(r"(?i)^deg +([cfk])$", lambda degree: f"deg{degree[1].upper()}", unit)
     return "%" if unit.lower() in _PERCENT else unit
 

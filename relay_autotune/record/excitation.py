@@ -291,9 +291,11 @@ def jumped_away(y: FloatArray) -> NDArray[np.bool_]:
     back, unless the record ends before. Where more than a tenth of the samples would be away, none
     is.
 
-    :param y: the measurement [y], shape (n,), n >= 2.
+    :param y: the measurement [y], shape (n,).
     """
     steps, away = np.diff(y), np.zeros(y.size, dtype=np.bool_)
+    if steps.size < 2:
+        return away
     few = min(2 * int(MOST_AWAY * y.size) + 1, steps.size)
     size = np.sort(np.partition(np.abs(steps), -few)[-few:])[::-1]
     stands_out = (size[:-1] > _APART * size[1:]) & (size[1:] > 0.0)

@@ -353,7 +353,7 @@ class Record:
     :param units: of the measurement, by "y", and of the command, by "u", as far as known.
     :ivar answers: answers that the record remembers, see :func:`cached_on_record`.
     :raises RecordError: if shapes differ, a value is not finite or beyond ``LARGEST``, the time
-        goes backwards, or the noise is negative.
+        goes backwards, or the noise or what is unseen is negative.
     """
 
     time: FloatArray
@@ -414,6 +414,10 @@ class Record:
         object.__setattr__(self, "cycle_start", starts)
         if math.isnan(self.unseen):
             object.__setattr__(self, "unseen", self._between_rows())
+        if not 0.0 <= self.unseen <= LARGEST:
+            raise RecordError(
+                f"unseen of the record is {self.unseen:g} s, expected a time from 0 to {LARGEST:g}"
+            )
         if self.noise_std < 0.0 or self.noise_std > LARGEST:
             raise RecordError(
                 f"noise_std of the record is {self.noise_std:g}, expected a number from 0 to "
@@ -463,7 +467,7 @@ class Record:
         # Where rows were left out the row before may be long ago: the usual time counts.
         usual = float(np.median(gaps))
         if self.is_of_changes:
-            return float(np.min(gaps[gaps > 0.0]))
+            return float(np.min(gaps, where=gaps > 0.0, initial=usual))
         return min(usual, float(np.median(gaps[moved])))
 
     @property

@@ -139,7 +139,7 @@ def sampling_period(record: Record) -> float:
     if record.unseen and record.is_of_changes:
         # Rows between were left out, but for those about changes of the command.
         gaps = np.diff(record.time)[np.diff(record.command) == 0.0]
-        period = float(np.min(gaps[gaps > 0.0]))
+        period = float(np.min(gaps, where=gaps > 0.0, initial=period))
     if period and not SHORTEST <= period <= LONGEST:
         raise IdentificationError(
             f"the samples are {period:.3g} s apart, expected {SHORTEST:g} to {LONGEST:g} s: check "

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from relay_autotune import DesignOptions, Record, analyse
+from relay_autotune.errors import RecordError
+from relay_autotune.record.excitation import find_experiments
 
 pytestmark = pytest.mark.long
 
@@ -123,3 +125,13 @@ def test_an_archive_of_changes_tells_when_the_command_moved():
 def test_a_part_of_a_table_tells_no_more_of_when_the_command_moved():
     record = _in_loop(late=1)
     assert record.unseen == record.part(40, len(record)).unseen == 1.0
+
+
+def test_what_is_unseen_is_a_time():
+    with pytest.raises(RecordError, match="unseen of the record is -1 s, expected a time from 0"):
+        Record(time=[0.0, 1.0], measurement=[1.0, 2.0], command=[0.0, 1.0], unseen=-1.0)
+    at_once = Record(time=[0.0, 0.0, 0.0], measurement=[1.0, 1.0, 3.0], command=[0.0, 1.0, 1.0])
+    assert at_once.is_of_changes
+    assert at_once.unseen == 0.0
+    for size in (1, 2, 3):
+        assert not find_experiments(at_once.part(0, size))
