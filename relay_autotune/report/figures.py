@@ -176,6 +176,11 @@ def draw_fit(case: Case, figure: Figure | SubFigure, *, narrow: bool) -> None:
         label="model",
     )  # fmt: skip
     above.set_ylabel("measurement [y]")
+    used = record.measurement[np.isfinite(model.fitted)]
+    if 0 < used.size < len(record):
+        # A sensor that dropped out would make a line of all others.
+        beside = above.margins()[1] * float(np.ptp(used))
+        above.set_ylim(float(used.min()) - beside, float(used.max()) + beside)
     _residual(below, record, model)
     below.set_xlabel("time [s]")
     above.margins(x=0.01)
@@ -195,7 +200,7 @@ def _residual(axes: Axes, record: Record, model: Identification) -> None:
     axes.axhline(0.0, color=MUTED, lw=0.8)
     axes.set_ylabel("residual [y]")
     # A residual that is only rounding is shown as a flat line.
-    least = _ROUNDING * float(np.ptp(record.measurement))
+    least = _ROUNDING * float(np.ptp(record.measurement[np.isfinite(model.fitted)]))
     if np.nanmax(np.abs(error)) < least:
         axes.set_ylim(-least, least)
 

@@ -60,6 +60,20 @@ def test_labels_are_in_the_units_of_the_recording() -> None:
     assert labels == ["measurement [bar]", "command [%]"]
 
 
+def test_a_fit_is_drawn_in_the_range_of_what_was_fitted() -> None:
+    case = case_of(completed(), "tank")
+    assert case.record is not None and case.model is not None
+    away = np.arange(len(case.record)) // 5 == 40
+    record = replace(case.record, measurement=np.where(away, 9999.0, case.record.measurement))
+    model = replace(case.model, fitted=np.where(away, np.nan, case.model.fitted))
+    plate = next(each for each in PLATES if each.key == "fit")
+    whole, parts = (
+        plate.figure(each).axes[0].get_ylim()
+        for each in (case, replace(case, record=record, model=model))
+    )
+    assert parts == pytest.approx(whole, rel=0.05)
+
+
 def test_thinning_keeps_every_extreme_of_a_long_signal() -> None:
     rng = np.random.default_rng(1)
     time, values = np.arange(50_000.0), rng.normal(size=50_000)
