@@ -116,6 +116,8 @@ def warned_of_rows(chosen: Identification, record: Record) -> Identification:
     :param record: the record.
     """
     unseen = record.unseen
+    if not unseen:
+        return chosen
     later = replace(chosen.model, dead_time=chosen.model.dead_time + unseen)
     point = ultimate_point(later)
     if point is None or abs(point.gain) > _MUCH_LESS * abs(chosen.ultimate_gain):

@@ -3,12 +3,15 @@
 
 """A table that a logger wrote: the command changed at some instant between two rows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from relay_autotune import DesignOptions, Record, analyse
 from relay_autotune.errors import RecordError
 from relay_autotune.record.excitation import find_experiments
+from relay_autotune.tuning.of_record import warned_of_rows
 
 pytestmark = pytest.mark.long
 
@@ -135,3 +138,11 @@ def test_what_is_unseen_is_a_time():
     assert at_once.unseen == 0.0
     for size in (1, 2, 3):
         assert not find_experiments(at_once.part(0, size))
+
+
+def test_where_nothing_is_unseen_nothing_is_said_of_it():
+    """A method may read another K_u from the cycles than its model has."""
+    record = replace(_in_loop(late=0), unseen=0.0)
+    found = analyse(record, alone=True)
+    higher = replace(found.model, ultimate_gain=2.0 * found.model.ultimate_gain)
+    assert warned_of_rows(higher, record) is higher
