@@ -38,6 +38,7 @@ from relay_autotune.record.record import (
     PiecewiseConstant,
     Record,
     RelaySettings,
+    usual_before_moves,
 )
 from relay_autotune.text import is_unit
 
@@ -272,10 +273,9 @@ def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
 
 def _between_readings(command: Signal) -> float:
     """Return the time between readings of a command [s]; 0: it was written where it changed."""
-    moves, gaps = np.diff(command.values), np.diff(command.time_ns) / 1e9
-    if np.all(moves):
+    if np.all(np.diff(command.values)):
         return 0.0
-    return min(float(np.median(gaps)), float(np.median(gaps[moves != 0.0])))
+    return usual_before_moves(_seconds(command.time_ns, int(command.time_ns[0])), command.values)
 
 
 def _in_units(record: Record, units: Mapping[str, str]) -> Record:

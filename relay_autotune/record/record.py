@@ -68,6 +68,18 @@ def cached_on_record(
     return ask
 
 
+def usual_before_moves(time: FloatArray, values: FloatArray) -> float:
+    """Return the usual time from a value to one that differs from it [s].
+
+    Where values were left out the one before may be long ago: the usual time counts then.
+
+    :param time: s, not decreasing, shape (n,).
+    :param values: at least two of them differ, shape (n,).
+    """
+    gaps = np.diff(time)
+    return min(float(np.median(gaps)), float(np.median(gaps[np.diff(values) != 0.0])))
+
+
 def roughness(y: FloatArray, used: np.ndarray | None = None) -> float:
     """Estimate white noise from second differences, which are small in a smooth signal [y].
 
@@ -461,14 +473,12 @@ class Record:
 
     def _between_rows(self) -> float:
         """Return the time between the rows of a table about changes of the command [s]; or 0."""
-        moved, gaps = np.flatnonzero(np.diff(self.command)), np.diff(self.time)
-        if not self.is_table or not moved.size:
+        if not (self.is_table and np.any(np.diff(self.command))):
             return 0.0
-        # Where rows were left out the row before may be long ago: the usual time counts.
-        usual = float(np.median(gaps))
-        if self.is_of_changes:
-            return float(np.min(gaps, where=gaps > 0.0, initial=usual))
-        return min(usual, float(np.median(gaps[moved])))
+        if not self.is_of_changes:
+            return usual_before_moves(self.time, self.command)
+        gaps = np.diff(self.time)
+        return float(np.min(gaps, where=gaps > 0.0, initial=self.interval))
 
     @property
     def is_of_changes(self) -> bool:

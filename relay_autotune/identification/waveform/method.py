@@ -284,8 +284,8 @@ def _is_stop(problem: Problem, begin: int, before: Fit, chosen: Choose) -> bool:
         whole = chosen(problem.thinned(_FEW), SIMPLE)
     except NoResponseError:
         return True
-    # A load that comes just there is no process that goes on.
     away = np.arange(problem.y.size) >= begin
+    # A load that comes just there is no process that goes on.
     return whole.problem.load is not None or _is_apart(problem, before, whole, away)
 
 
