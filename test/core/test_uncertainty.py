@@ -21,7 +21,11 @@ from relay_autotune.identification.result import Part
 from relay_autotune.identification.waveform.candidates import Candidate
 from relay_autotune.identification.waveform.determination import _combinations
 from relay_autotune.identification.waveform.fit_covariance import Fit, quantisation_step
-from relay_autotune.identification.waveform.posterior import _allowed, _apart, posterior
+from relay_autotune.identification.waveform.posterior import (
+    _allowed,
+    _difference_of_parts,
+    posterior,
+)
 from relay_autotune.identification.waveform.problem import problem_of
 from relay_autotune.identification.waveform.separable import evaluate, refine
 from relay_autotune.process.response import response
@@ -228,8 +232,8 @@ def test_a_part_with_one_model_says_nothing_of_the_scatter_between_parts():
     three = Part(1.0, 2.0, tuple(TransferFunction.fopdt(g, 1.0, 0.5) for g in (1.0, 1.1, 1.2)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert _apart((one, three), 1.0) == 0.0
-    assert _apart((three, three), 1.0) == pytest.approx(0.0)
+        assert _difference_of_parts((one, three), 1.0) == 0.0
+    assert _difference_of_parts((three, three), 1.0) == pytest.approx(0.0)
 
 
 @pytest.mark.parametrize(("end", "explained"), [(400, True), (200, False)])

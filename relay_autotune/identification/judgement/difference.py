@@ -31,7 +31,7 @@ from relay_autotune.errors import ModelError
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.posterior import DRAWS
 from relay_autotune.identification.waveform.residuals import Colour, colour_cost, colour_of
-from relay_autotune.identification.waveform.separable import left_of
+from relay_autotune.identification.waveform.separable import residual_of
 from relay_autotune.process.model_set import ModelErrors
 from relay_autotune.process.response import response
 from relay_autotune.record.excitation import LEAST_SAMPLES, only_move
@@ -213,7 +213,7 @@ def _power_beside_lines(time: FloatArray, x: FloatArray, pieces: int) -> float:
     :param pieces: with as many samples each.
     """
     parts = zip(np.array_split(time, pieces), np.array_split(x, pieces), strict=True)
-    left = [left_of(part, np.stack((np.ones(t.size), t - t[0]))) for t, part in parts]
+    left = [residual_of(part, np.stack((np.ones(t.size), t - t[0]))) for t, part in parts]
     return sum(float(e @ e) for e in left) / (x.size - 2 * pieces)
 
 

@@ -31,8 +31,8 @@ from relay_autotune.identification.waveform.separable import (
     Trial,
     evaluate,
     information_criterion,
-    left_of,
     refine,
+    residual_of,
 )
 from relay_autotune.identification.waveform.starts import (
     Guess,
@@ -145,7 +145,7 @@ class FitContext:
     sign: int
     held: bool
     loads: bool
-    _plain: dict[tuple[object, ...], Trial] = field(default_factory=dict, repr=False)
+    _fits: dict[tuple[object, ...], Trial] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, problem: Problem, sign: int, *, held: bool) -> FitContext:
@@ -224,7 +224,7 @@ class FitContext:
                 return None
         elif model.dead_time > (latest := self.latest[model.process_sign > 0]):
             # The measurement had moved by then, whatever else a fit would explain so.
-            return self.near(replace(problem, latest=latest), state)
+            return self.refit(replace(problem, latest=latest), state)
         if model.growth_in(1.0) > self.most_growth:
             return None
         if self._impossible(problem, state):
@@ -235,7 +235,7 @@ class FitContext:
         return Candidate(problem, state, model, self._score(problem, state, model))
 
     def _impossible(self, problem: Problem, state: Trial) -> list[str]:
-        """Return the terms beside a model of which its fit makes what cannot be, or what is none.
+        """Return the terms whose estimates are impossible, or too small to be a term.
 
         :param problem: what was fitted.
         :param state: the fit.
@@ -253,13 +253,13 @@ class FitContext:
         }
         return [term for term, may_be in possible.items() if not may_be]
 
-    def near(self, problem: Problem, state: Trial) -> Candidate | None:
+    def refit(self, problem: Problem, state: Trial) -> Candidate | None:
         """Fit a problem from the fit of a similar one; None as for :meth:`candidate`.
 
         :param problem: what is fitted.
         :param state: the fit of the similar one.
         """
-        return self.candidate(problem, _refined(problem, state))
+        return self.candidate(problem, _refit(problem, state))
 
     def _score(self, problem: Problem, state: Trial, model: TransferFunction) -> float:
         n = problem.time.size
@@ -304,17 +304,21 @@ class FitContext:
                 return []
         if "load" in terms:
             changed["load"] = likeliest_load(candidate.problem, candidate.state)
-        problem, state = _settled(replace(candidate.problem, **changed), candidate.state)
+        problem, state = _with_terms_in_place(
+            replace(candidate.problem, **changed), candidate.state
+        )
         if not _HIDDEN.isdisjoint(terms):
-            again = self._out_of_a_wrong_minimum(problem, state)
-            problem, state = (problem, state) if again is state else _settled(problem, again)
+            again = self._restarted_from_fopdt(problem, state)
+            problem, state = (
+                (problem, state) if again is state else _with_terms_in_place(problem, again)
+            )
         if "ends" in terms and self.bounded and state.cost >= self.unstable.cost:
             # What a controller keeps from growing looks as if large commands were not answered.
             return []
         other = self.candidate(problem, state)
         return [] if other is None else [other]
 
-    def loaded(self, candidate: Candidate) -> list[Candidate]:
+    def with_a_load(self, candidate: Candidate) -> list[Candidate]:
         """Return a candidate with a step of the load, another one in place of its own; or none.
 
         :param candidate: in white noise.
@@ -327,11 +331,11 @@ class FitContext:
         """The levels at which the actuator may end; None: nothing speaks for any."""
         return likeliest_ends(self.problem)
 
-    def _out_of_a_wrong_minimum(self, problem: Problem, state: Trial) -> Trial:
+    def _restarted_from_fopdt(self, problem: Problem, state: Trial) -> Trial:
         """Return a fit with a further term, begun anew where a FOPDT explains more.
 
         Without the term, a dead time or a lag may have stood for it. A richer structure explains
-        all that a FOPDT does, but for a little, or it is in another minimum.
+        at least what a FOPDT does; if it explains less, its fit is in a wrong minimum.
 
         :param problem: what was fitted.
         :param state: its fit, from that without the term.
@@ -357,11 +361,11 @@ class FitContext:
         """
         if not any(nuisances_of(problem)):
             return self.fopdt
-        key = _fitted(problem)
-        if key not in self._plain:
+        key = _key_of_fit(problem)
+        if key not in self._fits:
             starts = [self.fopdt.theta, *start_fopdt(problem, self.sign)]
-            self._plain[key] = best_of(problem, starts)
-        return self._plain[key]
+            self._fits[key] = best_of(problem, starts)
+        return self._fits[key]
 
     @cached_property
     def terms(self) -> list[tuple[str, ...]]:
@@ -390,7 +394,7 @@ class FitContext:
         fopdt = self._fopdt_of(problem)
         # A FOPDT has the longest dead time of all, since it includes every small lag.
         problem = drop_first_dead_time(problem, fopdt)
-        return replace(self, problem=problem, fopdt=fopdt, _plain={})
+        return replace(self, problem=problem, fopdt=fopdt, _fits={})
 
     def fit(
         self, names: Iterable[str], order: int = 0, ready: Sequence[Candidate] = ()
@@ -414,7 +418,7 @@ class FitContext:
             if name in same:
                 found.append(same[name])
                 continue
-            for structure in self._family(name, order):
+            for structure in self._structures_of(name, order):
                 problem = replace(self.problem, structure=structure)
                 if not structure.integrators:
                     problem = without(problem, ["friction"])
@@ -428,7 +432,7 @@ class FitContext:
                     found.append(self.candidate(problem, state))
         return [c for c in found if c is not None]
 
-    def turned(self) -> list[Candidate]:
+    def of_opposite_sign(self) -> list[Candidate]:
         """Return models of the direction opposite to the relay's, with an inverse response.
 
         With others no oscillation lasts. In the direction of the relay, a FOPDT shows the fast
@@ -437,22 +441,24 @@ class FitContext:
         found = []
         for structure in (SOPDT_ZERO, INTEGRATOR_INVERSE):
             problem = replace(self.problem, structure=structure)
-            state = multistart(problem, self.guess.turned(structure))
+            state = multistart(problem, self.guess.of_opposite_sign(structure))
             found.append(None if state is None else self.candidate(problem, state))
         return [c for c in found if c is not None and c.model.process_sign * self.sign < 0]
 
-    def refit(self, candidate: Candidate, colour: Colour | None) -> Candidate | None:
+    def refit_in_colour(self, candidate: Candidate, colour: Colour | None) -> Candidate | None:
         """Fit a candidate in another colour, without terms that come out impossible there.
 
         :param candidate: of this context's samples.
         :param colour: of the noise; None: white.
         """
         problem = replace(candidate.problem, colour=colour)
-        state = _refined(problem, candidate.state)
+        state = _refit(problem, candidate.state)
         none = self._impossible(problem, state)
-        return self.near(without(problem, none), state) if none else self.candidate(problem, state)
+        return (
+            self.refit(without(problem, none), state) if none else self.candidate(problem, state)
+        )
 
-    def _family(self, name: str, order: int) -> Iterator[Structure]:
+    def _structures_of(self, name: str, order: int) -> Iterator[Structure]:
         """Yield the structures of a name that there are samples enough for."""
         row = TABLE[name]
         if row.any_order:
@@ -475,18 +481,19 @@ class FitContext:
             return self.unstable
         state = multistart(problem, self._starts(self.guess, problem.structure), least)
         if problem.structure.zero is not None:
-            return self._beside_its_zero(problem, state, least)
+            return self._with_zero_on_either_side(problem, state, least)
         if state is not None:
-            self._plain[_fitted(problem)] = state
+            self._fits[_key_of_fit(problem)] = state
         return state
 
-    def _beside_its_zero(
+    def _with_zero_on_either_side(
         self, problem: Problem, state: Trial | None, least: float
     ) -> Trial | None:
         """Return a fit with a zero, begun anew where the structure without it explains more.
 
-        It explains at least as much, or it is in a wrong minimum. Where the zero is 0, dead time
-        and zero act alike to first order, and the search would stay: it begins on one side.
+        With the zero it explains at least as much, or its fit is in a wrong minimum. At a zero of
+        0, dead time and zero act alike to first order and the search would stay there, so that it
+        begins on either side.
 
         :param problem: with a zero.
         :param state: its fit; None where it is hopeless beside the least one.
@@ -494,7 +501,7 @@ class FitContext:
         """
         structure = problem.structure
         without_it = replace(problem, structure=replace(structure, zero=None))
-        within = self._plain.get(_fitted(problem)) or self._best_fit(without_it, least)
+        within = self._fits.get(_key_of_fit(problem)) or self._best_fit(without_it, least)
         if within is None or (state is not None and state.cost < within.cost):
             return state
         aside = np.append(np.zeros(within.theta.size - 1), _ASIDE)
@@ -504,26 +511,26 @@ class FitContext:
         return again if state is None else min(state, again, key=lambda s: s.cost)
 
 
-def _fitted(problem: Problem) -> tuple[object, ...]:
+def _key_of_fit(problem: Problem) -> tuple[object, ...]:
     """Return what tells the fits of one context apart, whose structures have no zero."""
     # The samples of a first dead time may have been dropped.
     terms = problem.load, problem.ends, *nuisances_of(problem)
     return problem.structure.denominator, problem.time.size, *terms
 
 
-def _refined(problem: Problem, state: Trial) -> Trial:
+def _refit(problem: Problem, state: Trial) -> Trial:
     """Return the fit of a problem, from that of a similar one."""
     return refine(problem, state.theta, tolerance=TRIAL, most=_STEPS)
 
 
-def _settled(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
+def _with_terms_in_place(problem: Problem, state: Trial) -> tuple[Problem, Trial]:
     """Return a problem with its load and ends where its fit says that they are, and that fit."""
-    state = _refined(problem, state)
+    state = _refit(problem, state)
     for _ in range(_MOVES):
         moved = problem.moved(state.coefficients)
         if moved is problem:
             break
-        problem, state = moved, _refined(moved, state)
+        problem, state = moved, _refit(moved, state)
     return problem, state
 
 
@@ -545,7 +552,7 @@ def without(problem: Problem, terms: Iterable[str]) -> Problem:
     return replace(problem, **absent)
 
 
-def as_in(other: Problem, problem: Problem) -> Problem:
+def with_terms_of(other: Problem, problem: Problem) -> Problem:
     """Return a problem with the structure and the terms beside the model of another one.
 
     :param other: has these.
@@ -571,7 +578,7 @@ def likeliest_load(problem: Problem, state: Trial) -> float:
     moved = few.time - instants[:, None]
     answers = few.seen(shifted_columns(few.structure, state.theta, moved, pulse()))
     answers = answers - (answers @ basis) @ basis.T
-    remaining = [float(np.sum(left_of(left, rows) ** 2)) for rows in answers.swapaxes(0, 1)]
+    remaining = [float(np.sum(residual_of(left, rows) ** 2)) for rows in answers.swapaxes(0, 1)]
     return float(instants[int(np.argmin(remaining))])
 
 

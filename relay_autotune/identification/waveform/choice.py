@@ -27,10 +27,10 @@ from relay_autotune.identification.waveform.candidates import (
     LITTLE,
     Candidate,
     FitContext,
-    as_in,
     drop_first_dead_time,
     moves_seldom,
     nuisances_of,
+    with_terms_of,
 )
 from relay_autotune.identification.waveform.fit_covariance import Fit, raw_residual
 from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem
@@ -45,8 +45,8 @@ from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Trial,
     information_criterion,
-    left_in_simulation,
     refine,
+    rms_in_simulation,
 )
 from relay_autotune.identification.waveform.starts import large_changes
 from relay_autotune.process.structures import (
@@ -160,7 +160,7 @@ def chosen_fit(
         parts = zip(problem.experiments, problem.inputs, strict=True)
         longest = max(answering_time(problem.time[part], u) for part, u in parts)
         problem = replace(problem, latest=_LATEST * longest)
-    few = _dense_enough(problem, sign, held)
+    few = _context_of_few_samples(problem, sign, held)
     found = _compared(few, known, among, before)
     _require_dynamics(few, found)
     dense = problem.thinned(_MOST_WHITE)
@@ -168,12 +168,12 @@ def chosen_fit(
         found = _on_more_samples(replace(few, problem=dense), found)
     own = [c for c in found if sign * c.model.process_sign >= 0]
     if found and sign and not known.structure:
-        turned = (few.refit(c, found[0].problem.colour) for c in few.turned())
+        turned = (few.refit_in_colour(c, found[0].problem.colour) for c in few.of_opposite_sign())
         found = [*found, *(c for c in turned if c is not None)]
-    # Where a disturbance that no term describes made a colour that explains the response, too,
-    # the simulation shows it, and the direction; unless that disturbance is all it shows.
+    # A disturbance that no term describes can make a colour that explains the response as well.
+    # The best simulation still shows the response and its direction: it is the second choice.
     slow = problem.colour is not None
-    white = [c if slow or c.problem.colour is None else few.refit(c, None) for c in own]
+    white = [c if slow or c.problem.colour is None else few.refit_in_colour(c, None) for c in own]
     simulated = [w for c, w in zip(own, white, strict=True) if w is not None and w is not c]
     own = [
         c
@@ -183,17 +183,18 @@ def chosen_fit(
     fits: list[Fit] = []
     for group in (own, simulated):
         ranked = sorted(group, key=lambda c: c.score)
-        finished = (_finished(c, found, problem, scale) for c in ranked)
+        finished = (_fitted_to_all(c, found, problem, scale) for c in ranked)
         fits += itertools.islice((fit for fit in finished if fit is not None), 1)
     if not fits:
         raise NoResponseError(known)
-    # Before a jump or without spikes the best simulation may: it shows these.
+    # Without odds of a response in colour, the best simulation: it shows jumps and spikes, which
+    # are left out next.
     *first, last = fits
     best = next((f for f in first if odds_of_response(f.problem, f.state) > ANSWERED), last)
     plain = next((c for c in own if c.structure == FOPDT), None)
     if plain is None or best.problem.structure == FOPDT:
         return best
-    return replace(best, plain=partial(_finished, plain, [], problem, scale))
+    return replace(best, plain=partial(_fitted_to_all, plain, [], problem, scale))
 
 
 def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candidate]:
@@ -205,11 +206,11 @@ def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candid
     again = []
     for c in found:
         if c.score <= found[0].score + _HOPELESS:
-            problem = drop_first_dead_time(as_in(c.problem, context.problem), c.state)
-            more = context.near(problem, c.state)
+            problem = drop_first_dead_time(with_terms_of(c.problem, context.problem), c.state)
+            more = context.refit(problem, c.state)
             if more is None:
                 continue
-            if c is found[0] and _colour(more.problem, more.state) is not None:
+            if c is found[0] and _colour_of_residual(more.problem, more.state) is not None:
                 return found
             again.append(more)
     return sorted(again, key=lambda c: c.score) or found
@@ -221,7 +222,7 @@ def _require_dynamics(context: FitContext, found: Sequence[Candidate]) -> None:
     thinned = float(np.median(np.diff(problem.index))) > 1.0
     if thinned or unit_steps(FOPDT, fopdt.theta)[-1] > problem.shortest:
         return
-    left, total = left_in_simulation(problem, fopdt.coefficients, fopdt.theta)
+    left, total = rms_in_simulation(problem, fopdt.coefficients, fopdt.theta)
     if left < 0.5 * total and all(mean_square_left(c) > _WORSE * left**2 for c in found):
         raise IdentificationError(
             "the measurement follows the command within one sample, "
@@ -233,10 +234,10 @@ def _require_dynamics(context: FitContext, found: Sequence[Candidate]) -> None:
 def odds_of_response(problem: Problem, state: Trial) -> float:
     """Return by how much the score of a response is better than that of a disturbance alone.
 
-    Each is in the colour of what it leaves. A slow disturbance explains any single slow excursion
-    of the measurement; each further change of the command that is answered adds to the odds. They
-    are asked of all samples, and of some for each response: a model that misses what is faster
-    than the loop may explain all that is slower.
+    Each score is in the colour of its own residual. A slow disturbance explains any single slow
+    excursion of the measurement, so each further answer to the command adds to the odds. The odds
+    are the better of two: of all samples, and of a few for each response, since a model can be
+    right below the frequencies of the loop and wrong above them.
 
     :param problem: what was fitted.
     :param state: its fit.
@@ -244,7 +245,10 @@ def odds_of_response(problem: Problem, state: Trial) -> float:
     white = replace(problem, colour=None)
     takes = unit_steps(problem.structure, state.theta, problem.shortest)[-1]
     some = int(_A_CURVE * max(float(np.ptp(problem.time) / takes), _RESPONSES))
-    return max(_odds(white.thinned(most), state.theta, problem.colour) for most in (_MOST, some))
+    return max(
+        _odds_over_disturbance(white.thinned(most), state.theta, problem.colour)
+        for most in (_MOST, some)
+    )
 
 
 def ahead_of_command(problem: Problem, state: Trial) -> float:
@@ -275,20 +279,20 @@ def ahead_of_command(problem: Problem, state: Trial) -> float:
     return 0.0
 
 
-def _odds(problem: Problem, theta: FloatArray, colour: Colour | None) -> float:
+def _odds_over_disturbance(problem: Problem, theta: FloatArray, colour: Colour | None) -> float:
     """Return by how much the score of a response is better than that of a disturbance alone.
 
     :param problem: has the samples, in white noise.
     :param theta: of the model.
     :param colour: in which it was fitted.
     """
-    alone, own = _likeliest(problem, problem.nuisances(theta), None)
+    alone, own = _best_in_any_colour(problem, problem.nuisances(theta), None)
     rows = problem.seen(problem.columns(theta))
-    answered = min(_likeliest(problem, rows, c)[0] for c in (colour, own))
+    answered = min(_best_in_any_colour(problem, rows, c)[0] for c in (colour, own))
     return alone - answered - theta.size * math.log(problem.time.size)
 
 
-def _likeliest(
+def _best_in_any_colour(
     problem: Problem, rows: FloatArray, colour: Colour | None
 ) -> tuple[float, Colour | None]:
     """Return the score of the best sum of some rows in the colour of what it leaves, and that.
@@ -315,7 +319,7 @@ def _likeliest(
     return best
 
 
-def _dense_enough(problem: Problem, sign: int, held: bool) -> FitContext:
+def _context_of_few_samples(problem: Problem, sign: int, held: bool) -> FitContext:
     """Return the context of evenly spaced samples, a few for each response of the process."""
     few = FitContext.of(problem.thinned(_FEW), sign, held=held)
     if few.problem.time.size == problem.time.size:
@@ -343,7 +347,7 @@ def _compared(
         names = first = [known.structure]
     simple = context.fit(first, known.order)
     if before is not None:
-        again = context.near(as_in(before.problem, context.problem), before.state)
+        again = context.refit(with_terms_of(before.problem, context.problem), before.state)
         simple += [] if again is None else [again]
     if not simple:
         return []
@@ -353,7 +357,7 @@ def _compared(
         # What came just before a step acts as a zero does, which no simple structure has.
         zeros = (_with_best_terms(context, [c]) for c in context.fit([SOPDT_ZERO.name]))
         decided = min((decided, *zeros), key=lambda c: _in_own_colour(context, c).score)
-    found = _with_terms(context, known, names, decided, simple)
+    found = _best_with_terms(context, known, names, decided, simple)
     if not found or context.loads or len(context.problem.bounds) > 1:
         return found
     if found[0].problem.colour is None and not context.bounded:
@@ -371,8 +375,8 @@ def _with_a_load(
 ) -> list[Candidate]:
     """Return structures beside a step of the load and those without one, the best first.
 
-    A load counts only if a simple structure beside it explains more than all without one, and
-    white noise is all that is left: between a few steps, a slow disturbance looks like a load.
+    A load counts only if a simple structure with it explains more than any without, and leaves
+    white noise: between a few steps, a slow disturbance looks like a load.
 
     :param context: the samples; a load may be estimated.
     :param known: the structure, if it is known.
@@ -380,28 +384,30 @@ def _with_a_load(
     :param found: all without a load, the best first.
     :param simple: some of them in white noise, without any terms.
     """
-    best = context.refit(found[0], None)
+    best = context.refit_in_colour(found[0], None)
     starts = [*simple, *([] if best is None else [best])]
-    loaded = [each for without in starts for each in context.loaded(without)]
+    loaded = [each for without in starts for each in context.with_a_load(without)]
     if loaded:
         # From a lag alone, the others find their way out of a minimum without a load.
         inside = context.with_nuisances_of(min(loaded, key=lambda c: c.score))
         some = inside.fit([c.structure.name for c in simple], known.order)
-        loaded += [each for rough in some for each in context.loaded(rough)]
-    better = [c for c in loaded if c.score < found[0].score and _is_white(c) and _is_apart(c)]
+        loaded += [each for rough in some for each in context.with_a_load(rough)]
+    better = [
+        c for c in loaded if c.score < found[0].score and _is_white(c) and _is_clear_of_moves(c)
+    ]
     if not better:
         return found
-    again = _with_terms(context, known, names, min(better, key=lambda c: c.score), loaded)
-    white = [c for c in _in(None, again, context) if c.score < found[0].score]
-    if not (white and _is_white(white[0]) and _is_apart(white[0])):
+    again = _best_with_terms(context, known, names, min(better, key=lambda c: c.score), loaded)
+    white = [c for c in _refit_all(None, again, context) if c.score < found[0].score]
+    if not (white and _is_white(white[0]) and _is_clear_of_moves(white[0])):
         return found
-    return sorted(_near([*white, *found]), key=lambda c: c.score)
+    return sorted(_not_hopeless([*white, *found]), key=lambda c: c.score)
 
 
-def _is_apart(candidate: Candidate) -> bool:
+def _is_clear_of_moves(candidate: Candidate) -> bool:
     """Return whether a load comes a dead time apart from each large move of the command.
 
-    Nearer ones may stand for the answer to that.
+    A nearer load can stand for a part of the answer to that move.
     """
     u, load = candidate.problem.inputs[0], candidate.problem.load
     if load is None or not isinstance(u, PiecewiseConstant):
@@ -415,7 +421,7 @@ def _is_white(candidate: Candidate) -> bool:
     return ljung_box(candidate.state.residual) >= _CHANCE
 
 
-def _with_terms(
+def _best_with_terms(
     context: FitContext,
     known: Known,
     names: Sequence[str],
@@ -442,7 +448,7 @@ def _with_terms(
         if not found:
             break
         best = min(best or found, found, key=lambda each: each[0].score)
-        start = context.refit(found[0], context.problem.colour)
+        start = context.refit_in_colour(found[0], context.problem.colour)
         if start is None or known.structure:
             break
         decided = _with_best_terms(context, [start])
@@ -476,11 +482,11 @@ def _with_best_terms(context: FitContext, found: Sequence[Candidate]) -> Candida
 
 def _in_own_colour(context: FitContext, candidate: Candidate) -> Candidate:
     """Return a candidate in the colour of its residual, or white where that is likelier."""
-    colour = _colour(candidate.problem, candidate.state)
+    colour = _colour_of_residual(candidate.problem, candidate.state)
     if colour is None:
         return candidate
     # A term that comes out impossible in the colour stays, and has its score in white noise.
-    coloured = context.near(replace(candidate.problem, colour=colour), candidate.state)
+    coloured = context.refit(replace(candidate.problem, colour=colour), candidate.state)
     return candidate if coloured is None else min(candidate, coloured, key=lambda c: c.score)
 
 
@@ -495,21 +501,23 @@ def _likeliest_colour(context: FitContext, simulated: list[Candidate]) -> list[C
     simulated = sorted(simulated, key=lambda c: c.score)
     if not simulated or simulated[0].state.cost <= context.floor:
         return simulated
-    own = _colour(simulated[0].problem, simulated[0].state)
+    own = _colour_of_residual(simulated[0].problem, simulated[0].state)
     if own is None:
         return simulated
-    found = _converged(_in(own, simulated, context), context)
+    found = _iterated_in_colour(_refit_all(own, simulated, context), context)
     least = min(map(mean_square_left, simulated))
     return found if found and _simulates(found[0], least) else simulated
 
 
-def _converged(found: list[Candidate], context: FitContext) -> list[Candidate]:
+def _iterated_in_colour(found: list[Candidate], context: FitContext) -> list[Candidate]:
     """Fit in the colour of the best one's residual, again until that changes no more."""
     for _ in range(_MOST_TIMES):
         if not found:
             return []
         best = found[0]
-        found = _in(_colour(best.problem, best.state), _near(found), context)
+        found = _refit_all(
+            _colour_of_residual(best.problem, best.state), _not_hopeless(found), context
+        )
         if found and found[0].structure == best.structure:
             scale = unit_steps(best.structure, best.state.theta)
             change = np.abs(found[0].state.theta - best.state.theta) / scale
@@ -518,27 +526,29 @@ def _converged(found: list[Candidate], context: FitContext) -> list[Candidate]:
     return found
 
 
-def _near(found: Sequence[Candidate]) -> list[Candidate]:
+def _not_hopeless(found: Sequence[Candidate]) -> list[Candidate]:
     """Return the candidates that are not hopeless."""
     most = min(c.score for c in found) + _HOPELESS
     return [c for c in found if c.score <= most or c.structure.name in PLAIN]
 
 
-def names_near(fit: Fit) -> list[str]:
+def names_not_hopeless(fit: Fit) -> list[str]:
     """Return the names of the structures that are not hopeless beside a chosen one.
 
     :param fit: with its candidates.
     """
-    return list(dict.fromkeys(c.structure.name for c in _near(fit.candidates)))
+    return list(dict.fromkeys(c.structure.name for c in _not_hopeless(fit.candidates)))
 
 
-def _in(colour: Colour | None, found: list[Candidate], context: FitContext) -> list[Candidate]:
+def _refit_all(
+    colour: Colour | None, found: list[Candidate], context: FitContext
+) -> list[Candidate]:
     """Return candidates fitted in one colour, the best first."""
-    again = (context.refit(c, colour) for c in found)
+    again = (context.refit_in_colour(c, colour) for c in found)
     return sorted((c for c in again if c is not None), key=lambda c: c.score)
 
 
-def _colour(problem: Problem, state: Trial) -> Colour | None:
+def _colour_of_residual(problem: Problem, state: Trial) -> Colour | None:
     """Return the colour of a fit's weighted residual; None: it is white."""
     left = raw_residual(problem, state)
     if problem.weight is not None:
@@ -561,10 +571,10 @@ def mean_square_left(found: Candidate | Fit) -> float:
     :param found: with what was fitted.
     """
     state = found.state
-    return left_in_simulation(found.problem, state.coefficients, state.theta)[0] ** 2
+    return rms_in_simulation(found.problem, state.coefficients, state.theta)[0] ** 2
 
 
-def _finished(
+def _fitted_to_all(
     candidate: Candidate, found: list[Candidate], problem: Problem, scale: float
 ) -> Fit | None:
     """Return the fit of a candidate to the end, in white noise to all samples."""
@@ -572,9 +582,12 @@ def _finished(
     if own.colour is not None:
         state = refine(own, candidate.state.theta)
     else:
-        own = drop_first_dead_time(as_in(own, problem), candidate.state)
+        own = drop_first_dead_time(with_terms_of(own, problem), candidate.state)
         state = refine(own, candidate.state.theta)
-        if own.time.size > candidate.problem.time.size and _colour(own, state) is not None:
+        if (
+            own.time.size > candidate.problem.time.size
+            and _colour_of_residual(own, state) is not None
+        ):
             # Samples so dense are correlated: those that were compared are not.
             own = candidate.problem
             state = refine(own, candidate.state.theta)

@@ -40,8 +40,8 @@ from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Trial,
-    left_in_simulation,
     refine,
+    rms_in_simulation,
 )
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
@@ -122,7 +122,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         loaded=problem.load is not None,
         play=problem.play_of(state.coefficients),
         friction=problem.dry_friction(state.coefficients),
-        to_explain=scale * left_in_simulation(problem, state.coefficients, state.theta)[1],
+        to_explain=scale * rms_in_simulation(problem, state.coefficients, state.theta)[1],
     )
     apart = f"{math.sqrt(allowed.temper):.2g}"
     if float(apart) > 1.0:

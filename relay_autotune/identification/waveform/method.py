@@ -28,7 +28,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.waveform.candidates import MANY, as_in
+from relay_autotune.identification.waveform.candidates import MANY, with_terms_of
 from relay_autotune.identification.waveform.choice import (
     ANSWERED,
     SIMPLE,
@@ -37,7 +37,7 @@ from relay_autotune.identification.waveform.choice import (
     ahead_of_command,
     chosen_fit,
     mean_square_left,
-    names_near,
+    names_not_hopeless,
     odds_of_response,
 )
 from relay_autotune.identification.waveform.findings import report
@@ -130,7 +130,9 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
     for record, u in zip(records, inputs, strict=True):
         _require_content(record, u)
     # In units of its own range, so that no unit of measurement is too large or too small.
-    scale = max(max(float(np.ptp(y)), float(np.abs(y).max()) * 1e-6) for y in _there(records))
+    scale = max(
+        max(float(np.ptp(y)), float(np.abs(y).max()) * 1e-6) for y in _without_jumps(records)
+    )
     problem = problem_of(
         [
             (record.time, (record.measurement - record.measurement[0]) / scale, u)
@@ -144,9 +146,9 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
     )
     samples, problem = problem.time.size, problem.thinned(_MOST_SAMPLES)
     sign = _sign(records)
-    alike = list(filter(None, map(_like_a_command, records)))
+    alike = list(filter(None, map(_exchanged, records)))
     try:
-        fit = _explained(
+        fit = _best_fit(
             problem, known, sign, scale, held=any(r.settings is not None for r in records)
         )
     except IdentificationError as error:
@@ -159,21 +161,23 @@ def identify_waveform_jointly(records: Sequence[Record], known: Known = NOTHING)
         fit = replace(fit, warnings=(*fit.warnings, warning))
     fit = replace(fit, warnings=(*alike, *fit.warnings))
     found = report(records, fit)
-    return found if fit.plain is None else replace(found, plain=partial(_beside, records, fit))
+    return found if fit.plain is None else replace(found, plain=partial(_plain_fit, records, fit))
 
 
-def _beside(records: Sequence[Record], fit: Fit) -> Identification | None:
+def _plain_fit(records: Sequence[Record], fit: Fit) -> Identification | None:
     """Return the FOPDT that was fitted beside a model; None if it cannot be fitted to the end."""
     assert fit.plain is not None
     plain = fit.plain()
     return None if plain is None else report(records, replace(plain, warnings=fit.warnings))
 
 
-def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held: bool) -> Fit:
-    """Fit, again with each experiment weighted by its noise, and again without spikes.
+def _best_fit(problem: Problem, known: Known, sign: int, scale: float, *, held: bool) -> Fit:
+    """Return the best fit, with each experiment weighted by its noise, and without spikes.
 
-    In open loop all of it is done again from a slow disturbance on where little speaks for a
-    response. Either search fails by showing none.
+    Where a response is not nearly certain in open loop, the search runs a second time, with the
+    noise taken for a slow disturbance. The fit with the better odds of a response is returned.
+
+    :raises NoResponseError: if neither search shows a response.
     """
 
     def chosen(samples: Problem, among: Sequence[str] = TRIED, before: Fit | None = None) -> Fit:
@@ -183,16 +187,16 @@ def _explained(problem: Problem, known: Known, sign: int, scale: float, *, held:
     def first(samples: Problem) -> Fit:
         return chosen(samples)
 
-    problem, dropped = _beside_dropouts(problem, first)
+    problem, dropped = _without_dropouts(problem, first)
     stopped = ""
     if not sign and len(problem.bounds) == 1:
         # Under a relay it turns around.
-        problem, stopped = _beside_stops(problem, chosen)
+        problem, stopped = _without_stops(problem, chosen)
 
     def searched(samples: Problem) -> tuple[float, Fit | None]:
         try:
-            fit = _by_noise(samples, first(samples), chosen)
-            fit = _spared_of_outliers(samples, fit, known, chosen)
+            fit = _weighted_by_noise(samples, first(samples), chosen)
+            fit = _without_spikes(samples, fit, known, chosen)
         except NoResponseError:
             return -math.inf, None
         return odds_of_response(fit.problem, fit.state), fit
@@ -222,12 +226,11 @@ def _moves_often(time: FloatArray, u: Input) -> bool:
     return changes_within(u, time).size >= MANY and not is_controlled(time, u)
 
 
-def _beside_stops(problem: Problem, chosen: Choose) -> tuple[Problem, str]:
-    """Return the samples on one side of a stop or a sensor's end, and a warning.
+def _without_stops(problem: Problem, chosen: Choose) -> tuple[Problem, str]:
+    """Return the samples before or after a stop or the end of a sensor's range, and a warning.
 
-    The measurement stays at an end of its range in mid-movement, and the model of what comes
-    before moves on: there the process does not answer, or it is not seen. The side on which the
-    command moves more often tells more.
+    At a stop the measurement stays at an end of its range, and a model of the samples before it
+    moves on. The side with more moves of the command is kept, because it tells more.
 
     :param problem: all samples.
     :param chosen: fits samples.
@@ -267,7 +270,7 @@ def _beside_stops(problem: Problem, chosen: Choose) -> tuple[Problem, str]:
             )
             if changes_within(u, after.time).size <= changes.size:
                 return before, f"{warning}after it were left out"
-            after, more = _beside_stops(after, chosen)
+            after, more = _without_stops(after, chosen)
             return after, "; ".join(filter(None, (f"{warning}before it were left out", more)))
     return problem, ""
 
@@ -286,10 +289,12 @@ def _is_stop(problem: Problem, begin: int, before: Fit, chosen: Choose) -> bool:
         return True
     away = np.arange(problem.y.size) >= begin
     # A load that comes just there is no process that goes on.
-    return whole.problem.load is not None or _is_apart(problem, before, whole, away)
+    return whole.problem.load is not None or _has_a_level_of_its_own(problem, before, whole, away)
 
 
-def _is_apart(problem: Problem, rest: Fit, whole: Fit, away: NDArray[np.bool_]) -> bool:
+def _has_a_level_of_its_own(
+    problem: Problem, rest: Fit, whole: Fit, away: NDArray[np.bool_]
+) -> bool:
     """Return whether samples with a level of their own explain more than a process does.
 
     :param problem: all samples.
@@ -299,23 +304,23 @@ def _is_apart(problem: Problem, rest: Fit, whole: Fit, away: NDArray[np.bool_]) 
     """
     n, floor = away.size, away.size * NEGLIGIBLE**2
     runs = runs_of(away)
-    apart = float(np.sum(~away)) * _left_of(rest, problem.part(~away))
+    apart = float(np.sum(~away)) * _mean_square_left(rest, problem.part(~away))
     apart += sum((stop - begin) * float(np.var(problem.y[begin:stop])) for begin, stop in runs)
     # Each level and its first and last instants are estimated; the last may be the record's.
     parameters = 3 * len(runs) - int(away[-1])
-    gained = information_criterion(n * _left_of(whole, problem), n, 0, floor)
+    gained = information_criterion(n * _mean_square_left(whole, problem), n, 0, floor)
     return gained - information_criterion(apart, n, parameters, floor) > ANSWERED
 
 
-def _left_of(fit: Fit, problem: Problem) -> float:
+def _mean_square_left(fit: Fit, problem: Problem) -> float:
     """Return the mean square that a model leaves of samples."""
-    return mean_square_left(replace(fit, problem=as_in(fit.problem, problem)))
+    return mean_square_left(replace(fit, problem=with_terms_of(fit.problem, problem)))
 
 
-def _beside_dropouts(problem: Problem, chosen: Callable[[Problem], Fit]) -> tuple[Problem, str]:
+def _without_dropouts(problem: Problem, chosen: Callable[[Problem], Fit]) -> tuple[Problem, str]:
     """Return the samples without those of a sensor that dropped out, and a warning.
 
-    What jumps may be a fast process, whose best model then explains the jumps.
+    A fast process jumps, too. Its samples are kept: its best model explains the jumps.
 
     :param problem: all samples.
     :param chosen: fits samples with the best of all structures.
@@ -334,18 +339,18 @@ def _beside_dropouts(problem: Problem, chosen: Callable[[Problem], Fit]) -> tupl
         return problem, ""
     with contextlib.suppress(NoResponseError):
         whole = chosen(problem)
-        if not _is_apart(problem, rest, whole, away):
+        if not _has_a_level_of_its_own(problem, rest, whole, away):
             return problem, ""
     warning = (
         f"{int(away.sum())} of the samples, the first at {problem.time[np.argmax(away)]:.4g} s, "
         "lie beyond a jump that no process makes, and were left out: check the sensor for dropouts"
     )
     # Smaller jumps stand out once the largest are left out.
-    there, more = _beside_dropouts(there, chosen)
+    there, more = _without_dropouts(there, chosen)
     return there, "; ".join(filter(None, (warning, more)))
 
 
-def _there(records: Sequence[Record]) -> list[FloatArray]:
+def _without_jumps(records: Sequence[Record]) -> list[FloatArray]:
     """Return what each record measures where its sensor has not dropped out."""
     return [y[~jumped_away(y)] for y in (r.measurement for r in records)]
 
@@ -365,7 +370,7 @@ def _sign(records: Sequence[Record]) -> int:
     return found.pop() if found else 0
 
 
-def _by_noise(problem: Problem, fit: Fit, chosen: Choose) -> Fit:
+def _weighted_by_noise(problem: Problem, fit: Fit, chosen: Choose) -> Fit:
     """Fit again with each experiment weighted by its noise, where noises differ."""
     parts = fit.problem.experiments
     if len(parts) == 1:
@@ -375,7 +380,7 @@ def _by_noise(problem: Problem, fit: Fit, chosen: Choose) -> Fit:
         return fit
     part, state = fit.problem, fit.state
     for _ in range(_MOST_ROUNDS):
-        # The noisy experiments pulled the fit, which changed the noise found in the others.
+        # Noisy experiments pulled the fit, so the noise found in the others was wrong.
         earlier, part = noise, _weighted(part, noise)
         state = refine(part, state.theta, tolerance=TRIAL)
         noise = _noise_of_each(part, state)
@@ -398,7 +403,7 @@ def _weighted(problem: Problem, noise: FloatArray) -> Problem:
     return replace(problem, weight=weight)
 
 
-def _spared_of_outliers(problem: Problem, fit: Fit, known: Known, chosen: Choose) -> Fit:
+def _without_spikes(problem: Problem, fit: Fit, known: Known, chosen: Choose) -> Fit:
     """Fit again without isolated spikes, or with the loss that was asked for."""
     base = np.ones(problem.time.size)
     if fit.problem.weight is not None:
@@ -408,14 +413,14 @@ def _spared_of_outliers(problem: Problem, fit: Fit, known: Known, chosen: Choose
         first, weight = _reweighted(problem, fit, known.loss, base), base.copy()
         weight[_places(problem, first.problem)] = first.problem.weight
         again = chosen(replace(problem, weight=weight))
-        return _counted(_reweighted(problem, again, known.loss, base))
+        return _of_weighted_samples(_reweighted(problem, again, known.loss, base))
     outlying = _outliers(problem, fit.problem, fit.state)
     if not np.any(outlying):
         return fit
-    # They would pull both the choice and the fit.
+    # Spikes pull the choice of the structure as well as the fit.
     rest = replace(problem, weight=base) if len(problem.bounds) > 1 else problem
-    # They hide differences, so that what was hopeless with them is without them.
-    again = chosen(rest.part(~outlying), names_near(fit), fit)
+    # Spikes hide differences: a structure that was hopeless with them is hopeless without.
+    again = chosen(rest.part(~outlying), names_not_hopeless(fit), fit)
     warning = (
         f"{int(np.sum(outlying))} of the samples lie more than {_OUTLIER:g} standard deviations "
         "off every model and were left out: check the sensor for spikes"
@@ -438,7 +443,7 @@ def _reweighted(whole: Problem, fit: Fit, loss: str, base: FloatArray) -> Fit:
     return replace(fit, problem=problem, state=state, base=own, loss=loss, plain=None)
 
 
-def _counted(fit: Fit) -> Fit:
+def _of_weighted_samples(fit: Fit) -> Fit:
     """Return a fit without the samples of which its loss takes nothing."""
     assert fit.problem.weight is not None and fit.base is not None
     some = np.flatnonzero(fit.problem.weight)
@@ -469,8 +474,7 @@ def _outliers(whole: Problem, problem: Problem, state: Trial) -> NDArray[np.bool
     far = np.abs(error - middle) > most
     if not (width > NEGLIGIBLE and 0.0 < far.mean() <= MOST_AWAY):
         return found
-    # Where more are in a row, or a line between their neighbours misses the model as well, there
-    # is something that the model lacks.
+    # More of them in a row, or neighbours that miss the model as well: the model lacks something.
     across = white.seen(np.interp(n, n[~far], problem.y[~far]) - problem.y + left) - middle
     longest = max(stop - begin for begin, stop in runs_of(far))
     if longest <= _SPIKE and np.abs(across[far]).max() <= most:
@@ -497,11 +501,11 @@ def _require_content(record: Record, u: Input) -> None:
             f"the measurement is constant at {y[0]:g} although the command changes: check the "
             "sensor, the actuator and that both topics belong to one loop"
         )
-    if np.all((y == y.min()) | (y == y.max())) and (problem := _like_a_command(record)):
+    if np.all((y == y.min()) | (y == y.max())) and (problem := _exchanged(record)):
         raise IdentificationError(problem)
 
 
-def _like_a_command(record: Record) -> str:
+def _exchanged(record: Record) -> str:
     """Return what to look at where the measurement moves as commands do; empty: it does not."""
     y, u = record.measurement, record.command
     levels, (moves, changes) = np.unique(y), (np.count_nonzero(np.diff(x)) for x in (y, u))

@@ -31,10 +31,10 @@ from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Trial,
     evaluate,
-    left_by,
-    left_in_simulation,
-    left_of,
     refine,
+    residual_of,
+    residual_of_model,
+    rms_in_simulation,
 )
 from relay_autotune.process.structures import Structure
 from relay_autotune.process.transfer_function import TransferFunction
@@ -106,8 +106,8 @@ def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: fl
     """
     rng = np.random.default_rng(0)
     parts = _parts(fit, inflation, rng)
-    temper = max(_apart(parts, frequency) / _BY_CHANCE, 1.0)
-    most = _most_left(fit)
+    temper = max(_difference_of_parts(parts, frequency) / _BY_CHANCE, 1.0)
+    most = _largest_rms(fit)
     mixture: list[TransferFunction] = []
     models: list[TransferFunction] = []
     # The chosen one was fitted to the end.
@@ -115,7 +115,7 @@ def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: fl
     for candidate, share in zip(fit.candidates[1:], shares[1:], strict=True):
         problem, state = candidate.problem, candidate.state
         count = round(DRAWS * share)
-        if count and left_in_simulation(problem, state.coefficients, state.theta)[0] <= most:
+        if count and rms_in_simulation(problem, state.coefficients, state.theta)[0] <= most:
             drawn = _draws(problem, state, fit.scale, inflation * temper, count, rng).models
             mixture += drawn
             models += _on_both_sides(drawn, problem, state)
@@ -125,7 +125,7 @@ def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: fl
     if temper > 1.0:
         # The process changed from one part to the other: both are among the models.
         models += [m for part in parts for m in part.models[:_SHARE]]
-    models += [m for m in _plain(fit) for _ in range(_SHARE)]
+    models += [m for m in _plain_models(fit) for _ in range(_SHARE)]
     return Posterior(tuple(models), tuple(mixture), own.values, own.models, parts, temper)
 
 
@@ -139,13 +139,13 @@ def _on_both_sides(
     return [replace(m, gain=m.gain * sides[i // 2 % 2]) for i, m in enumerate(models)]
 
 
-def _plain(fit: Fit) -> list[TransferFunction]:
+def _plain_models(fit: Fit) -> list[TransferFunction]:
     """Return the plain models that simulate the record as well, or nearly so beside a colour.
 
     Part of what a colour explains may be a response that a plain model would explain.
     """
     white = fit.problem.colour is None
-    most, found = _most_left(fit, 0.0 if white else _AS_WELL), []
+    most, found = _largest_rms(fit, 0.0 if white else _AS_WELL), []
     for candidate in fit.candidates:
         if candidate.structure.name not in PLAIN:
             continue
@@ -157,9 +157,9 @@ def _plain(fit: Fit) -> list[TransferFunction]:
     return found
 
 
-def _most_left(fit: Fit, share: float = _AS_WELL) -> float:
+def _largest_rms(fit: Fit, share: float = _AS_WELL) -> float:
     """Return the largest rms of a model that simulates a record as well as the chosen one."""
-    left, total = left_in_simulation(fit.problem, fit.state.coefficients, fit.state.theta)
+    left, total = rms_in_simulation(fit.problem, fit.state.coefficients, fit.state.theta)
     return left + share * total
 
 
@@ -232,7 +232,7 @@ def _full_reach(problem: Problem) -> int:
     return int(np.argmax(reach >= _FULL * reach.max()))
 
 
-def _apart(parts: Sequence[Part], frequency: float) -> float:
+def _difference_of_parts(parts: Sequence[Part], frequency: float) -> float:
     """Return the mean square of the difference of two parts' responses over its covariance.
 
     With d the difference of the mean logarithms of their responses at one frequency, as real and
@@ -326,7 +326,7 @@ class _Density:
         at[-1] = max(float(at[-1]), 0.0)
         far = float(np.sum(((at - self.centre) / self.deviation) ** 2))
         point = _Point(at, sign, np.empty(0), 1.0, far)
-        left = left_by(self.problem, self.coefficients(point), self.theta(point))
+        left = residual_of_model(self.problem, self.coefficients(point), self.theta(point))
         return replace(point, left=left, variance=max(self.noise(left), NEGLIGIBLE**2))
 
     def axes_at(self, point: _Point) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -466,7 +466,7 @@ def _allowed(
             values.append(read[1])
     rise = start.cost(here.variance) - here.cost(here.variance)
     excluded = rise > 2.0 * float(gammaincinv(0.5 * centre.size, 1.0 - _EXCLUDED))
-    left, total = left_in_simulation(problem, density.coefficients(here), density.theta(here))
+    left, total = rms_in_simulation(problem, density.coefficients(here), density.theta(here))
     explains = 2.0 * left**2 < total**2
     return _Drawn(tuple(models), np.array(values), excluded, explains)
 
@@ -523,4 +523,4 @@ def _slopes(problem: Problem, gain: FloatArray, theta: FloatArray) -> FloatArray
     by_theta = np.einsum(
         "k,mkn->mn", np.concatenate((gain, beside))[: derivatives.shape[1]], derivatives
     )
-    return left_of(problem.seen(np.concatenate((columns[:k], by_theta))), rows[1:])
+    return residual_of(problem.seen(np.concatenate((columns[:k], by_theta))), rows[1:])

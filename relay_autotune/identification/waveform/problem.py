@@ -332,21 +332,21 @@ class Problem:
         They are the command, then those of `_further` but friction.
         """
         each = zip(self.inputs, self.experiments, strict=True)
-        return [(_clipped(u, self.ends), *self._beside(u, part)) for u, part in each]
+        return [(_clipped(u, self.ends), *self._inputs_of_terms(u, part)) for u, part in each]
 
-    def _beside(self, u: Input, part: slice) -> Iterator[PiecewiseConstant]:
+    def _inputs_of_terms(self, u: Input, part: slice) -> Iterator[PiecewiseConstant]:
         if self.past:
             # The level before is that of a step at the first sample, with the same response.
             yield pulse(float(self.time[part][0]))
         if self.unequal:
             yield distance(u, middle_of(u))
         if self.play:
-            yield _turns(u)
+            yield _direction_of_moves(u)
         if self.load is not None:
             yield from (pulse(self.load, length) for length in (math.inf, self.shortest))
         if self.ends is not None:
             low, high = self.ends
-            yield from (_changed(u, lambda x: x < low), is_above(u, high))
+            yield from (_mapped(u, lambda x: x < low), is_above(u, high))
 
     @cached_property
     def lines(self) -> list[FloatArray]:
@@ -418,7 +418,7 @@ def pulse(begin: float = 0.0, length: float = math.inf) -> PiecewiseConstant:
     return PiecewiseConstant(np.array([begin, begin + length]), np.array([1.0, 0.0]), 0.0)
 
 
-def _changed(u: Input, of: Callable[[FloatArray], NDArray[Any]]) -> PiecewiseConstant:
+def _mapped(u: Input, of: Callable[[FloatArray], NDArray[Any]]) -> PiecewiseConstant:
     """Return a function of a held command, from its value at first."""
     assert isinstance(u, PiecewiseConstant)
     values = np.asarray(of(u.levels), dtype=float)
@@ -430,12 +430,12 @@ def _clipped(u: Input, ends: tuple[float, float] | None) -> Input:
 
     :param ends: as ``Problem.ends``.
     """
-    return u if ends is None else _changed(u, lambda x: np.clip(x, *ends))
+    return u if ends is None else _mapped(u, lambda x: np.clip(x, *ends))
 
 
 def is_above(u: Input, level: float) -> PiecewiseConstant:
     """Return 1 while a held command is above a level, less what it is at first."""
-    return _changed(u, lambda x: x > level)
+    return _mapped(u, lambda x: x > level)
 
 
 def middle_of(u: Input) -> float:
@@ -456,10 +456,10 @@ def middle_of(u: Input) -> float:
 
 def distance(u: Input, level: float) -> PiecewiseConstant:
     """Return how much farther from a level a held command is than at first [u]."""
-    return _changed(u, lambda x: np.abs(x - level))
+    return _mapped(u, lambda x: np.abs(x - level))
 
 
-def _turns(u: Input) -> PiecewiseConstant:
+def _direction_of_moves(u: Input) -> PiecewiseConstant:
     """Return the direction of a held command's last move, 1 or -1, and 0 before the first.
 
     Behind a play that every move crosses, a process feels the command less half of the play in
@@ -475,7 +475,7 @@ def _shown_play(u: Input, time: FloatArray, *, held: bool) -> float:
     """Return the least way of a command between two turns, where that shows a play [u]; or 0."""
     if not isinstance(u, PiecewiseConstant):
         return 0.0
-    turns = _turns(u)
+    turns = _direction_of_moves(u)
     # Of the last move little is seen.
     times = turns.times[(turns.times >= time[0]) & (turns.times < time[-1])][:-1]
     if not times.size:

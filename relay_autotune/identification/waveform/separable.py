@@ -75,7 +75,7 @@ def evaluate(problem: Problem, theta: FloatArray) -> Trial:
     size = np.sqrt(np.einsum("kn,kn->k", columns, columns))
     size[size == 0.0] = 1.0
     q, r = np.linalg.qr((columns / size[:, None]).T)
-    coefficients = _backward(r.tolist(), (q.T @ y).tolist()) / size
+    coefficients = _back_substituted(r.tolist(), (q.T @ y).tolist()) / size
     residual = y - coefficients @ columns
     derivative = problem.seen(
         np.einsum("k,mkn->mn", coefficients[: derivatives.shape[1]], derivatives)
@@ -84,7 +84,7 @@ def evaluate(problem: Problem, theta: FloatArray) -> Trial:
     return Trial(theta, coefficients, residual, cost, q, derivative, columns)
 
 
-def left_of(y: FloatArray, rows: FloatArray) -> FloatArray:
+def residual_of(y: FloatArray, rows: FloatArray) -> FloatArray:
     """Return what the best combinations of some rows leave of one or several others.
 
     :param y: shape (..., n).
@@ -94,7 +94,7 @@ def left_of(y: FloatArray, rows: FloatArray) -> FloatArray:
     return np.asarray(y - factors.T @ rows)
 
 
-def left_by(problem: Problem, gain: FloatArray, theta: FloatArray) -> FloatArray:
+def residual_of_model(problem: Problem, gain: FloatArray, theta: FloatArray) -> FloatArray:
     """Return what a model leaves, as seen, once all beside it is fitted, shape (n,).
 
     :param problem: the samples.
@@ -104,10 +104,10 @@ def left_by(problem: Problem, gain: FloatArray, theta: FloatArray) -> FloatArray
     columns = problem.columns(theta)
     left = problem.y - gain @ columns[: gain.size]
     first, *beside = problem.seen(np.concatenate((left[None, :], columns[gain.size :])))
-    return left_of(first, np.array(beside))
+    return residual_of(first, np.array(beside))
 
 
-def left_in_simulation(
+def rms_in_simulation(
     problem: Problem, coefficients: FloatArray, theta: FloatArray
 ) -> tuple[float, float]:
     """Return the rms that a model leaves in simulation, and that of what it is to explain.
@@ -119,12 +119,12 @@ def left_in_simulation(
     :param theta: of the model, shape (m,).
     """
     problem = replace(problem, colour=None)
-    left = left_by(problem, coefficients[: len(problem.structure.powers)], theta)
-    total = left_of(problem.y_seen, problem.nuisances(theta))
+    left = residual_of_model(problem, coefficients[: len(problem.structure.powers)], theta)
+    total = residual_of(problem.y_seen, problem.nuisances(theta))
     return math.sqrt(float(np.mean(left**2))), math.sqrt(float(np.mean(total**2)))
 
 
-def _backward(r: list[list[float]], right: list[float]) -> FloatArray:
+def _back_substituted(r: list[list[float]], right: list[float]) -> FloatArray:
     """Solve ``r c = right`` for an upper triangle r of a few columns, each of length one.
 
     The coefficient of a column that depends on the others stays zero. So do those of columns

@@ -29,9 +29,9 @@ from relay_autotune.identification.waveform.separable import (
     Trial,
     evaluate,
     information_criterion,
-    left_of,
     predicted_cost,
     refine,
+    residual_of,
 )
 from relay_autotune.process.factors import Quadratic
 from relay_autotune.process.response import response
@@ -244,7 +244,7 @@ def multistart(
     starts: Sequence[FloatArray | Trial] = thetas
     for steps, count in _ROUNDS:
         reached = [refine(few, s, tolerance=_COARSE, most=steps) for s in starts[:count]]
-        starts = reached = _apart_from_each_other(problem, reached)
+        starts = reached = _distinct(problem, reached)
         if not reached or min(predicted_cost(few, s) for s in reached) > bound:
             return None
     if reached[0].cost > bound:
@@ -268,7 +268,7 @@ def best_of(problem: Problem, thetas: Sequence[FloatArray]) -> Trial:
     return found
 
 
-def _apart_from_each_other(problem: Problem, states: list[Trial]) -> list[Trial]:
+def _distinct(problem: Problem, states: list[Trial]) -> list[Trial]:
     """Return distinct states, the best first."""
     chosen: list[Trial] = []
     for state in sorted(states, key=lambda s: s.cost):
@@ -383,7 +383,7 @@ def likeliest_ends(problem: Problem) -> tuple[float, float] | None:
         seen = np.concatenate((few.y[part][None], *every, line))
         if few.colour is not None:
             seen = few.colour.whitened(seen)
-        left = left_of(seen[: -len(line)], seen[-len(line) :])
+        left = residual_of(seen[: -len(line)], seen[-len(line) :])
         measured.append(left[0])
         answers.append(left[1:].reshape(_LAGS, len(inputs), dead_times.size, time.size))
     y, rows = np.concatenate(measured), np.concatenate(answers, axis=-1).swapaxes(0, 2)
@@ -397,7 +397,7 @@ def likeliest_ends(problem: Problem) -> tuple[float, float] | None:
             felt = 0.5 * (of[low] + (-of[high] if high else of[0]))
             gains = np.linalg.lstsq(felt.T, y, rcond=None)[0]
             shifts = (gains @ of[_LEVELS + at] for at in finite)
-            costs.append(float(np.sum(left_of(y, np.stack((*felt, *shifts))) ** 2)))
+            costs.append(float(np.sum(residual_of(y, np.stack((*felt, *shifts))) ** 2)))
         return information_criterion(min(costs), y.size, len(finite), y.size * NEGLIGIBLE**2)
 
     pairs = itertools.combinations(range(_LEVELS + 2), 2)
@@ -496,7 +496,7 @@ class Guess:
             found += [np.append(theta[:-1], _HIDDEN * theta[-1]) for theta in found]
         return found
 
-    def turned(self, structure: Structure) -> list[FloatArray]:
+    def of_opposite_sign(self, structure: Structure) -> list[FloatArray]:
         """Return starts of an inverse response, of which the FOPDT shows the fast part.
 
         :param structure: with a zero, and two lags, or an integrator and one.
