@@ -59,16 +59,20 @@ class Special:
         them.
     :param of_document: the way back.
     :param to_message: writes it into a message.
-    :param of_message: the way back; as :func:`of_message`.
+    :param of_message: the way back; it raises :class:`WrongFieldError`.
     """
 
     to_document: Callable[[Any], dict[str, Any]]
     of_document: Callable[[Any], Any]
     to_message: Callable[[Any, Any], None] | None = None
-    of_message: Callable[[Any, type[RelayAutotuneError], str], Any] | None = None
+    of_message: Callable[[Any], Any] | None = None
 
 
 SPECIAL: dict[type, Special] = {}
+
+
+class WrongFieldError(Exception):
+    """A field of a message, and what is wrong with it; :func:`of_message` says of what it is."""
 
 
 # Documents.
@@ -265,56 +269,59 @@ def _write_columns(message: Any, items: Sequence[object], kind: type, prefix: st
             setattr(message, name, list(values) if each.kind is str else float64_array(values))
 
 
-def of_message(
-    kind: type[_T], message: Any, error: type[RelayAutotuneError], of: str, prefix: str = ""
-) -> _T:
+def of_message(kind: type[_T], message: Any, error: type[RelayAutotuneError], of: str) -> _T:
     """Return the result that a message tells.
 
     :param kind: class of the result.
     :param message: of rclpy, or decoded from a bag.
     :param error: what to raise.
     :param of: what the fields belong to, as in "of the model".
-    :param prefix: of the names of its fields.
     :raises RelayAutotuneError: of that kind, if a number is outside of its declared range, arrays
         that go together differ in length, or a derived number contradicts the others.
     """
+    try:
+        return _of_message(kind, message, "")
+    except WrongFieldError as found:
+        name, problem = found.args
+        raise error(f"{name} {of} {problem}") from None
+
+
+def _of_message(kind: type[_T], message: Any, prefix: str) -> _T:
     special = SPECIAL.get(kind)
     if special is not None and special.of_message is not None:
-        return special.of_message(message, error, of)
+        return special.of_message(message)
     found: dict[str, Any] = {}
     for each in result_fields(kind):  # type: ignore[arg-type]
         if each.message is None or each.derived:
             continue
         part, many = _part_of(each.kind)
         if part is not None and many:
-            found[each.name] = _read_columns(part, message, error, of, each.prefix)
+            found[each.name] = _read_columns(part, message, each.prefix)
         elif part is not None:
-            nested = of_message(part, message, error, of, each.prefix)
+            nested = _of_message(part, message, each.prefix)
             # A part that was not computed has a default in each of its fields.
             absent = each.default is None and repr(nested) == repr(part())
             found[each.name] = None if absent else nested
         else:
-            found[each.name] = _of_field(each, message, error, of, prefix)
+            found[each.name] = _of_field(each, message, prefix)
     value = kind(**found)
-    _check_derived(value, message, error, of, prefix)
+    _check_derived(value, message, prefix)
     return value
 
 
-def _of_field(
-    each: ResultField, message: Any, error: type[RelayAutotuneError], of: str, prefix: str
-) -> Any:
+def _of_field(each: ResultField, message: Any, prefix: str) -> Any:
     name = each.message or prefix + each.name
     held = getattr(message, name)
     if get_origin(each.kind) is np.ndarray:
         held = np.asarray(held, dtype=np.float64)
-        require_length(name, len(held), len(message.parameters), "parameters", error, of)
+        require_length(name, len(held), len(message.parameters), "parameters")
     elif get_origin(each.kind) is tuple:
         held = tuple(_shown(get_args(each.kind)[0](item)) for item in held)
     else:
         held = _shown(each.kind(held))
     problem = each.problem(held) if isinstance(held, float | np.ndarray) else None
     if problem is not None:
-        raise error(f"{name} {of} {problem}")
+        raise WrongFieldError(name, problem)
     return held
 
 
@@ -323,19 +330,17 @@ def _shown(held: Any) -> Any:
     return visible(held) if type(held) is str else held
 
 
-def _read_columns(
-    kind: Any, message: Any, error: type[RelayAutotuneError], of: str, prefix: str
-) -> tuple[Any, ...]:
+def _read_columns(kind: Any, message: Any, prefix: str) -> tuple[Any, ...]:
     columns: dict[str, list[Any]] = {}
     first = ""
     for each in result_fields(kind):
         parts = []
         for name, _ in _parts(each, prefix):
             held, first = list(getattr(message, name)), first or name
-            require_length(name, len(held), len(getattr(message, first)), first, error, of)
+            require_length(name, len(held), len(getattr(message, first)), first)
             problem = None if each.kind is str else each.problem(held)
             if problem is not None:
-                raise error(f"{name} {of} {problem}")
+                raise WrongFieldError(name, problem)
             parts.append(held)
         columns[each.name] = list(map(each.kind, *parts))
     return tuple(
@@ -343,28 +348,22 @@ def _read_columns(
     )
 
 
-def require_length(
-    name: str, found: int, expected: int, first: str, error: type[RelayAutotuneError], of: str
-) -> None:
+def require_length(name: str, found: int, expected: int, first: str) -> None:
     """Refuse an array of a message that does not go with another one.
 
     :param name: of the array.
     :param found: its length.
     :param expected: the length that it has to have.
     :param first: name of the other one.
-    :param error: what to raise.
-    :param of: what the array belongs to, as in "of the model".
-    :raises RelayAutotuneError: of that kind.
+    :raises WrongFieldError: if it has another length.
     """
     if found != expected:
-        raise error(
-            f"{name} {of} has {found} numbers, expected {expected}: one for each of {first}"
+        raise WrongFieldError(
+            name, f"has {found} numbers, expected {expected}: one for each of {first}"
         )
 
 
-def _check_derived(
-    value: Any, message: Any, error: type[RelayAutotuneError], of: str, prefix: str
-) -> None:
+def _check_derived(value: Any, message: Any, prefix: str) -> None:
     kind: Any = type(value)
     derived = [f for f in result_fields(kind) if f.derived]
     said = {f.name: float(getattr(message, prefix + f.name)) for f in derived}
@@ -372,7 +371,8 @@ def _check_derived(
     for name in said if any(said.values()) else ():
         follows = getattr(value, name)
         if not abs(said[name] - follows) <= _SAME * abs(follows):
-            raise error(
-                f"{name} {of} is {said[name]:g}, but the other numbers make it {follows:g}: they "
-                f"contradict each other"
+            raise WrongFieldError(
+                name,
+                f"is {said[name]:g}, but the other numbers make it {follows:g}: they contradict "
+                "each other",
             )

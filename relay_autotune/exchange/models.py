@@ -19,6 +19,7 @@ from relay_autotune.errors import MissingPackageError, ModelError, RelayAutotune
 from relay_autotune.exchange.fields import (
     SPECIAL,
     Special,
+    WrongFieldError,
     float64_array,
     json_number,
     json_numbers,
@@ -144,14 +145,14 @@ def model_of_message(message: Any) -> TransferFunction:
     )
 
 
-def _estimate_of_message(message: Any, error: type[RelayAutotuneError], of: str) -> Estimate:
+def _estimate_of_message(message: Any) -> Estimate:
     model, names = model_of_message(message), tuple(map(str, message.parameters))
     std = np.asarray(message.std, dtype=np.float64)
     covariance = np.asarray(message.covariance, dtype=np.float64)
-    require_length("std", std.size, len(names), "parameters", error, of)
-    require_length("covariance", covariance.size, len(names) ** 2, "parameters", error, of)
+    require_length("std", std.size, len(names), "parameters")
+    require_length("covariance", covariance.size, len(names) ** 2, "parameters")
     if bool(np.any(std < 0.0)):
-        raise error(f"std {of} has a negative number, expected >= 0 or NaN")
+        raise WrongFieldError("std", "has a negative number, expected >= 0 or NaN")
     covariance = covariance.reshape(len(names), len(names))
     if len(message.time_constants) + model.integrators == model.order:
         # Roots of the polynomials are rounded.
@@ -169,9 +170,10 @@ def _estimate_of_message(message: Any, error: type[RelayAutotuneError], of: str)
     for name in ("numerator", "denominator"):
         given, follows = list(getattr(message, name)), list(getattr(found_model, name))
         if len(given) != len(follows) or not np.allclose(given, follows, rtol=_SAME, atol=0.0):
-            raise error(
-                f"{name} {of} is {given}, but its gain and time constants make it {follows}: they "
-                f"contradict each other"
+            raise WrongFieldError(
+                name,
+                f"is {given}, but its gain and time constants make it {follows}: they contradict "
+                "each other",
             )
     return Estimate(structure, values, covariance)
 
