@@ -164,16 +164,13 @@ def _of_pair(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]
     from relay_autotune.bag.pairing import pair_of
 
     names, notes = pair_of(topics, wanted)
-    measured, commanded = topics.signals(names).values()
+    signals = list(topics.signals(names).values())
+    measured, commanded = signals
     notes = [*notes, *measured.notes, *commanded.notes]
-    signals = [measured.signal, commanded.signal]
     difference = abs(measured.lag_ns - commanded.lag_ns)
     if difference > _CLOCK_DIFFERENCE_NS:
         # The publishers' clocks disagree: both are put on the recorder's.
-        signals = [
-            replace(timed.signal, time_ns=timed.signal.time_ns + timed.lag_ns)
-            for timed in (measured, commanded)
-        ]
+        signals = [replace(each, time_ns=each.time_ns + each.lag_ns) for each in signals]
         notes.append(
             f"the clocks behind {names[0]} and {names[1]} differ by {difference / 1e9:.3f} s; "
             f"they are aligned by the recorder's clock"

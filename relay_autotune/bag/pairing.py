@@ -97,7 +97,7 @@ def pair_of(topics: Topics, wanted: Selection) -> tuple[tuple[str, str], list[st
             f"measurement and command are looked for among {MOST_SEARCHED} at most; name them "
             f"with --measurement TOPIC --command TOPIC"
         )
-    signals = [timed.signal for timed in topics.signals().values()]
+    signals = list(topics.signals().values())
     pairs = plausible_pairs(signals, **({} if given is None else {role: given}))
     chosen, reasons = _only(topics, pairs)
     return chosen, [*notes, *reasons]
@@ -126,7 +126,7 @@ def _only(topics: Topics, pairs: Sequence[Pair]) -> tuple[tuple[str, str], list[
             [(flags_of(y, u), reason) for y, u, reason in pairs],
         )
     # More pairs than topics: the names say too little, and the topics are the shorter list.
-    looks = {name: look_of(timed.signal)[1] for name, timed in topics.signals().items()}
+    looks = {name: look_of(signal)[1] for name, signal in topics.signals().items()}
     number = f"{len(pairs)} pairs" if pairs else "no pair"
     raise SelectionError(
         f"{topics.path} holds no recorded experiment and {number} of topics that may be "
@@ -266,9 +266,7 @@ def named_pair(topics: Topics, wanted: Selection) -> tuple[str, str, str]:
     named = (wanted.measurement, wanted.command)
     fits = [_of_role(found, *each) for each in zip(_ROLES, named, strict=True)]
     signals = topics.signals({c.name for own in fits for c in own if c.role != "named"})
-    still = {
-        name for name, t in signals.items() if not len(t.signal) or not np.ptp(t.signal.values)
-    }
+    still = {name for name, s in signals.items() if not len(s) or not np.ptp(s.values)}
     measured, commanded = _together(*([c for c in own if c.name not in still] for own in fits))
     if any(c.steps for c in commanded):
         commanded = [c for c in commanded if c.steps]
@@ -425,7 +423,7 @@ def _require_most_moved(
         if name != joint
     ]
     signals = topics.signals([y.name, *others])
-    swing = {name: float(np.ptp(timed.signal.values)) for name, timed in signals.items()}
+    swing = {name: float(np.ptp(signal.values)) for name, signal in signals.items()}
     most = max(swing, key=lambda name: swing[name])
     if most != y.name:
         raise SelectionError(

@@ -50,7 +50,7 @@ def read(
 
         return read_columns(paths[0], columns)
     with opened(paths, clock) as topics:
-        return {name: timed.signal for name, timed in topics.signals(columns).items()}
+        return topics.signals(columns)
 
 
 def paths_of(given: Path | str | Sequence[Path | str]) -> list[Path]:

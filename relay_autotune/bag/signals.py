@@ -101,19 +101,26 @@ class Selection:
 
 
 @dataclass(frozen=True)
-class TimedSignal:
-    """The values of a topic, and the lag of its clock.
+class Signal:
+    """One recorded quantity.
 
-    :param signal: the values by the time of the chosen clock, or, where that is not known, by
-        the time at which they were recorded.
+    :param name: topic or column.
+    :param time_ns: time of each value [ns], not decreasing, shape (n,): that of the chosen clock,
+        or, where that is not known, the time at which it was recorded.
+    :param values: the values, shape (n,).
     :param lag_ns: smallest time from the clock's time to recording [ns]: the delay of the
         transport and the difference of the two clocks.
     :param notes: what to know about it, each a sentence.
     """
 
-    signal: Signal
-    lag_ns: int
+    name: str
+    time_ns: IntArray
+    values: FloatArray
+    lag_ns: int = 0
     notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return int(self.values.size)
 
 
 class SignalReader:
@@ -172,7 +179,7 @@ class SignalReader:
         """Whether the times need not be compared with the recorder's."""
         return self._log_times is not None or (self._rising and self._all_dated)
 
-    def signal(self) -> TimedSignal:
+    def signal(self) -> Signal:
         """Return what was collected; nothing can be added after that.
 
         :raises SelectionError: if messages came, and say why none of them has a value.
@@ -209,21 +216,4 @@ class SignalReader:
                     f"the {self.clock} times of {self.name} go backwards; "
                     f"its log times are used instead"
                 )
-        return TimedSignal(Signal(self.name, times, values), lag, tuple(notes))
-
-
-@dataclass(frozen=True)
-class Signal:
-    """One recorded quantity.
-
-    :param name: topic or column.
-    :param time_ns: time of each value [ns], not decreasing, shape (n,).
-    :param values: the values, shape (n,).
-    """
-
-    name: str
-    time_ns: IntArray
-    values: FloatArray
-
-    def __len__(self) -> int:
-        return int(self.values.size)
+        return Signal(self.name, times, values, lag, tuple(notes))

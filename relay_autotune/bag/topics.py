@@ -34,7 +34,7 @@ from relay_autotune.bag.field_path import (
 )
 from relay_autotune.bag.limits import MOST_DEFINITIONS, MOST_EXPECTED
 from relay_autotune.bag.mcap_records import Messages
-from relay_autotune.bag.signals import SignalReader, TimedSignal
+from relay_autotune.bag.signals import Signal, SignalReader
 from relay_autotune.errors import BagError, FieldError, SelectionError
 
 # Called with the progress of reading: bytes done, bytes in all.
@@ -75,7 +75,7 @@ class Topics:
     files: Sequence[BagFile]
     clock: str = "publish"
     progress: Progress | None = None
-    _signals: dict[str, TimedSignal] = field(default_factory=dict)
+    _signals: dict[str, Signal] = field(default_factory=dict)
     _types: dict[tuple[str, str, str, bytes], Struct] = field(default_factory=dict)
     _by_topic: dict[str, list[tuple[int, Channel]]] = field(default_factory=dict)
     _defined: int = 0
@@ -208,7 +208,7 @@ class Topics:
             found += zip(messages.log_time.tolist(), decoded, strict=True)
         return [message for _, message in sorted(found, key=lambda item: item[0])]
 
-    def signals(self, names: Iterable[str] | None = None) -> dict[str, TimedSignal]:
+    def signals(self, names: Iterable[str] | None = None) -> dict[str, Signal]:
         """Return the values of topics.
 
         :param names: the topics, each with a field where its type has several numbers; default:
@@ -222,7 +222,7 @@ class Topics:
             self._signals.update(self._read(unread))
         return {name: self._signals[name] for name in chosen}
 
-    def _read(self, names: Sequence[str]) -> dict[str, TimedSignal]:
+    def _read(self, names: Sequence[str]) -> dict[str, Signal]:
         readers = self._readers(names)
         again = [name for name, reader in readers.items() if not reader.in_order]
         if again:

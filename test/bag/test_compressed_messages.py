@@ -89,7 +89,7 @@ def write_payload(path, payload):
 def read(path, **limits):
     """Return the values of /x, and what was said."""
     with McapFile(path, **limits) as file:
-        return Topics(path, [file]).signals(["/x"])["/x"].signal.values, file.notes
+        return Topics(path, [file]).signals(["/x"])["/x"].values, file.notes
 
 
 def test_a_directory_that_rosbags_wrote(tmp_path):

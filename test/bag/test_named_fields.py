@@ -240,7 +240,7 @@ def test_a_bag_of_joints_is_read_by_name(tmp_path):
     orders = [["left", "right"], ["right", "left"], ["gripper"], ["arm", "left", "right"]]
     path = bag_of_joints(tmp_path / "bag.mcap", orders)
     found = signal_of(path, "/joint_states:position[left]")
-    assert found.signal.values.tolist() == [1.0, 11.0, 31.0]
+    assert found.values.tolist() == [1.0, 11.0, 31.0]
     (note,) = found.notes
     assert "1 of 4 messages" in note and "has no 'left'; it has gripper" in note
 

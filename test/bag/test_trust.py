@@ -57,7 +57,7 @@ def read(path, **limits):
     """Return the values of /x, and what was said."""
     with McapFile(path, **limits) as file:
         topics = Topics(path, [file])
-        signal = topics.signals(["/x"])["/x"].signal
+        signal = topics.signals(["/x"])["/x"]
         return signal.values, file.notes
 
 
@@ -322,7 +322,7 @@ def test_a_file_that_shrinks_while_it_is_read(tmp_path):
     with McapFile(path) as file:
         with path.open("r+b") as other:
             other.truncate(5000)
-        found = Topics(path, [file]).signals(["/x"])["/x"].signal
+        found = Topics(path, [file]).signals(["/x"])["/x"]
         assert 0 < len(found) < COUNT
         assert file.notes
 
@@ -362,9 +362,9 @@ def test_the_index_and_the_chunks_say_the_same(
             topics = Topics(file, [opened])
             found = topics.signals(sorted(wanted & set(topics.types())))
             assert opened.notes == []
-        for name, timed in found.items():
+        for name, signal in found.items():
             expected = [float(k) for k, (which, _) in enumerate(turns) if names[which] == name]
-            assert timed.signal.values.tolist() == expected
+            assert signal.values.tolist() == expected
 
 
 @pytest.mark.parametrize(

@@ -47,8 +47,8 @@ def write(path, type_name, definition, payloads, *, encoding="ros2msg", **option
 def read(path, name, clock="publish"):
     """Return a signal with the notes about it."""
     with McapFile(path) as file:
-        timed = Topics(path, [file], clock).signals([name])[name]
-        return timed.signal, (*timed.notes, *file.notes)
+        signal = Topics(path, [file], clock).signals([name])[name]
+        return signal, (*signal.notes, *file.notes)
 
 
 def made(type_name, *messages):
