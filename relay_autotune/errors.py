@@ -9,7 +9,8 @@ import errno
 import os
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
@@ -146,6 +147,20 @@ def system_says(error: Exception) -> str:
     :param error: of the system, or another one.
     """
     return getattr(error, "strerror", None) or str(error)
+
+
+@contextmanager
+def told(error: type[RelayAutotuneError], what: str, advice: str = "") -> Iterator[None]:
+    """Raise an error of this package where the system refuses something in the block.
+
+    :param error: its class.
+    :param what: cannot be done, with the file.
+    :param advice: what follows the system's own words.
+    """
+    try:
+        yield
+    except OSError as refusal:
+        raise error(f"{what}: {system_says(refusal)}{advice}") from refusal
 
 
 # A pipe without a reader; a disk, or what stands for one, that takes no more.

@@ -36,7 +36,7 @@ from relay_autotune.bag.words import (
     unit_in,
     without_unit,
 )
-from relay_autotune.errors import BagError, NotThereError, SelectionError, system_says
+from relay_autotune.errors import BagError, NotThereError, SelectionError, told
 
 # Least time that is taken as seconds since 1970: no experiment lasts that long.
 EPOCH = 1.0e8
@@ -100,10 +100,8 @@ class Log:
 def _table(path: Path) -> Iterator[TextTable]:
     """Give the table in a file, and sentences for what else may be in it."""
     try:
-        with open_regular(path) as file:
+        with told(BagError, f"cannot read {path}"), open_regular(path) as file:
             yield TextTable(path, file)
-    except OSError as error:
-        raise BagError(f"cannot read {path}: {system_says(error)}") from error
     except UnicodeError:
         raise BagError(f"{path} is not a text file; expected CSV in UTF-8") from None
     except csv.Error as error:

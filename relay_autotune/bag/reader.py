@@ -18,7 +18,7 @@ from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.signals import CLOCKS, Signal
 from relay_autotune.bag.source import known_start, open_regular
 from relay_autotune.bag.topics import Progress, Topics
-from relay_autotune.errors import BagError, RelayAutotuneError, system_says
+from relay_autotune.errors import BagError, RelayAutotuneError, told
 
 _STORED = (".mcap", ".db3")
 _TEXTS = (".csv", ".txt", ".dat", ".tsv", ".log")
@@ -167,10 +167,8 @@ def _opened(path: Path, largest: int) -> BagFile:
 def _data_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
-    try:
+    with told(BagError, f"cannot read {path}"):
         entries = sorted(path.iterdir(), key=_natural)
-    except OSError as error:
-        raise BagError(f"cannot read {path}: {system_says(error)}") from error
     # The folder itself counts: a killed recorder's metadata.yaml is missing or out of date.
     plain = {entry.name for entry in entries if entry.suffix in _STORED}
     # A recorder that was killed while it compressed leaves both.

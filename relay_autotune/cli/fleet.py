@@ -29,7 +29,7 @@ from typing import Any, Self
 
 from relay_autotune.cli.arguments import DONE, exit_status, worst
 from relay_autotune.cli.jobs import Done, Job, died, work
-from relay_autotune.errors import BagError, SelectionError, system_says
+from relay_autotune.errors import BagError, SelectionError, told
 from relay_autotune.exchange.fields import columns
 from relay_autotune.exchange.models import COLUMNS as OF_PROCESS
 from relay_autotune.identification.result import FitReport, Identification
@@ -85,10 +85,8 @@ class ResultsFile:
             raise BagError(f"{self.path} is no regular file; name another one")
         self.done: set[str] = set()
         self.status = DONE
-        try:
+        with told(BagError, f"cannot write {self.path}"):
             self._file = self.path.open("a+b")
-        except OSError as error:
-            raise BagError(f"cannot write {self.path}: {system_says(error)}") from error
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._take_up()
@@ -116,11 +114,9 @@ class ResultsFile:
         :param document: on one line.
         :raises BagError: if the file system refuses.
         """
-        try:
+        with told(BagError, f"cannot write {self.path}"):
             self._file.write(document.encode() + b"\n")
             self._file.flush()
-        except OSError as error:
-            raise BagError(f"cannot write {self.path}: {system_says(error)}") from error
         self.done.add(name)
 
     def _take_up(self) -> None:
@@ -155,7 +151,7 @@ class ResultsFile:
 
     def _write_table(self) -> None:
         new = self._table.with_name(self._table.name + ".tmp")
-        try:
+        with told(BagError, f"cannot write {self._table}"):
             if self._table.suffix.lower() == ".csv":
                 with new.open("w", newline="", encoding="utf-8") as file:
                     writer = csv.DictWriter(file, COLUMNS)
@@ -173,8 +169,6 @@ class ResultsFile:
                 table = pyarrow.Table.from_pylist(list(self._rows()), schema=schema)
                 pyarrow.parquet.write_table(table, new)
             new.replace(self._table)
-        except OSError as error:
-            raise BagError(f"cannot write {self._table}: {system_says(error)}") from error
 
 
 def rows(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
