@@ -165,27 +165,25 @@ class Quantity:
 class _Field:
     """The field of a dataclass as it is declared, before it is said what it means.
 
-    :param default: MISSING: it has none.
-    :param metadata: of the field, for the sentence that says what it means.
+    :param quantity: without name and description.
     """
 
-    default: Any
-    metadata: Callable[[str], dict[str, Any]]
+    quantity: Quantity
 
     def means(self, sentence: str) -> Any:
         """Return the field of a dataclass.
 
         :param sentence: for people.
         """
-        return field(default=self.default, metadata=self.metadata(sentence))
+        found = self.quantity.means(sentence)
+        return field(default=found.default, metadata={_DECLARED: found})
 
 
 def quantity(
     default: float | int | bool | str, unit: str = "", *others: Any, **named: Any
 ) -> _Field:
     """Declare the field of a dataclass as a quantity; the arguments are :class:`Quantity`'s."""
-    found = Quantity("", default, unit, *others, **named)
-    return _Field(default, lambda sentence: {_DECLARED: found.means(sentence)})
+    return _Field(Quantity("", default, unit, *others, **named))
 
 
 @cache

@@ -14,7 +14,6 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
-    HistoryPolicy,
     LivelinessPolicy,
     QoSCompatibility,
     QoSProfile,
@@ -102,14 +101,11 @@ def require_apart(node: Node) -> None:
 
 def for_bag(profile: QoSProfile) -> Qos:
     """Return a profile as a recording's metadata describe it."""
-    best_effort = profile.reliability == ReliabilityPolicy.BEST_EFFORT
-    latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    keep_all = profile.history == HistoryPolicy.KEEP_ALL
     return Qos(
-        reliability="best_effort" if best_effort else "reliable",
-        durability="transient_local" if latched else "volatile",
-        history="keep_all" if keep_all else "keep_last",
-        depth=int(profile.depth),
+        profile.reliability.name.lower(),
+        profile.durability.name.lower(),
+        profile.history.name.lower(),
+        int(profile.depth),
     )
 
 
