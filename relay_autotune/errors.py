@@ -150,7 +150,7 @@ def system_says(error: Exception) -> str:
 
 
 @contextmanager
-def told(error: type[RelayAutotuneError], what: str, advice: str = "") -> Iterator[None]:
+def os_errors_as(error: type[RelayAutotuneError], what: str, advice: str = "") -> Iterator[None]:
     """Raise an error of this package where the system refuses something in the block.
 
     :param error: its class.

@@ -36,7 +36,7 @@ from relay_autotune.bag.words import (
     unit_in,
     without_unit,
 )
-from relay_autotune.errors import BagError, NotThereError, SelectionError, told
+from relay_autotune.errors import BagError, NotThereError, SelectionError, os_errors_as
 
 # Least time that is taken as seconds since 1970: no experiment lasts that long.
 EPOCH = 1.0e8
@@ -100,7 +100,7 @@ class Log:
 def _table(path: Path) -> Iterator[TextTable]:
     """Give the table in a file, and sentences for what else may be in it."""
     try:
-        with told(BagError, f"cannot read {path}"), open_regular(path) as file:
+        with os_errors_as(BagError, f"cannot read {path}"), open_regular(path) as file:
             yield TextTable(path, file)
     except UnicodeError:
         raise BagError(f"{path} is not a text file; expected CSV in UTF-8") from None

@@ -18,7 +18,7 @@ from relay_autotune.bag.limits import LARGEST_CHUNK
 from relay_autotune.bag.signals import CLOCKS, Signal
 from relay_autotune.bag.source import known_start, open_regular
 from relay_autotune.bag.topics import Progress, Topics
-from relay_autotune.errors import BagError, RelayAutotuneError, told
+from relay_autotune.errors import BagError, RelayAutotuneError, os_errors_as
 
 _STORED = (".mcap", ".db3")
 _TEXTS = (".csv", ".txt", ".dat", ".tsv", ".log")
@@ -167,7 +167,7 @@ def _opened(path: Path, largest: int) -> BagFile:
 def _data_files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
-    with told(BagError, f"cannot read {path}"):
+    with os_errors_as(BagError, f"cannot read {path}"):
         entries = sorted(path.iterdir(), key=_natural)
     # The folder itself counts: a killed recorder's metadata.yaml is missing or out of date.
     plain = {entry.name for entry in entries if entry.suffix in _STORED}

@@ -23,7 +23,7 @@ from relay_autotune.bag.limits import (
     MOST_MESSAGES,
     UNSUSPICIOUS,
 )
-from relay_autotune.errors import BagError, system_says, told
+from relay_autotune.errors import BagError, os_errors_as, system_says
 
 MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format 3\0"
@@ -205,7 +205,7 @@ class Source:
     def _expand(self) -> None:
         """Expand a file that is compressed as a whole into a temporary file."""
         try:
-            with told(BagError, f"cannot expand {self.path}"), self._file as compressed:
+            with os_errors_as(BagError, f"cannot expand {self.path}"), self._file as compressed:
                 # close() closes it, which deletes it.
                 self._file = tempfile.TemporaryFile(prefix="relay_autotune_")  # noqa: SIM115
                 room = shutil.disk_usage(tempfile.gettempdir()).free - FREE_DISK

@@ -29,7 +29,7 @@ from typing import Any, Self
 
 from relay_autotune.cli.arguments import DONE, exit_status, worst
 from relay_autotune.cli.jobs import Done, Job, died, work
-from relay_autotune.errors import BagError, SelectionError, told
+from relay_autotune.errors import BagError, SelectionError, os_errors_as
 from relay_autotune.exchange.fields import columns
 from relay_autotune.exchange.models import COLUMNS as OF_PROCESS
 from relay_autotune.identification.result import FitReport, Identification
@@ -85,7 +85,7 @@ class ResultsFile:
             raise BagError(f"{self.path} is no regular file; name another one")
         self.done: set[str] = set()
         self.status = DONE
-        with told(BagError, f"cannot write {self.path}"):
+        with os_errors_as(BagError, f"cannot write {self.path}"):
             self._file = self.path.open("a+b")
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -114,7 +114,7 @@ class ResultsFile:
         :param document: on one line.
         :raises BagError: if the file system refuses.
         """
-        with told(BagError, f"cannot write {self.path}"):
+        with os_errors_as(BagError, f"cannot write {self.path}"):
             self._file.write(document.encode() + b"\n")
             self._file.flush()
         self.done.add(name)
@@ -151,7 +151,7 @@ class ResultsFile:
 
     def _write_table(self) -> None:
         new = self._table.with_name(self._table.name + ".tmp")
-        with told(BagError, f"cannot write {self._table}"):
+        with os_errors_as(BagError, f"cannot write {self._table}"):
             if self._table.suffix.lower() == ".csv":
                 with new.open("w", newline="", encoding="utf-8") as file:
                     writer = csv.DictWriter(file, COLUMNS)

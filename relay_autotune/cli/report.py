@@ -33,7 +33,7 @@ from relay_autotune.cli.arguments import (
 )
 from relay_autotune.cli.jobs import Job, add_analysis, add_details, analysed, jobs_of, present_of
 from relay_autotune.cli.terminal import Working
-from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError, told
+from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError, os_errors_as
 from relay_autotune.report import PICTURES, is_ours, write_figures, write_page, write_picture
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def _run(options: argparse.Namespace) -> int:
     write_report(cases, options.output, title=options.title)
     print(options.output)
     if folder := options.figures:
-        with told(BagError, f"the figures cannot be written to {folder}"):
+        with os_errors_as(BagError, f"the figures cannot be written to {folder}"):
             if any(Path(folder).glob(f"*.{options.format}")):
                 say(PROGRAM, f"{folder} has figures already; those of the same name are replaced")
             for path in write_figures(cases, folder, options.format):
@@ -178,7 +178,9 @@ def check_output(output: str) -> None:
     if path.suffix.lower() == ".html":
         # A missing package is reported here, too.
         import relay_autotune.report.page  # noqa: F401
-    refused = told(SelectionError, f"the report {path} cannot be written", "; name another file")
+    refused = os_errors_as(
+        SelectionError, f"the report {path} cannot be written", "; name another file"
+    )
     # Only an attempt tells of rights, of file systems and of the length of names.
     with refused, path.open("ab"):
         pass
@@ -204,7 +206,7 @@ def write_report(cases: Sequence[Case], output: str, *, title: str = "") -> None
     :param title: default: the first case's source.
     :raises BagError: if the file cannot be written.
     """
-    with told(BagError, f"the report {output} cannot be written"):
+    with os_errors_as(BagError, f"the report {output} cannot be written"):
         if Path(output).suffix.lower() == ".html":
             write_page(cases, output, title=title)
         else:
