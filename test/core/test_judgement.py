@@ -358,6 +358,25 @@ def test_a_controller_that_is_read_backward_gives_no_gains():
     assert analyse(record, alone=True).best_gains is None
 
 
+def test_a_slow_law_is_read_backward_through_a_rounded_command():
+    """From row to row the rounding looks as what comes from outside."""
+    interval, n, rng = 0.5, 1200, np.random.default_rng(0)
+    plant = VirtualProcess(TransferFunction.sopdt(3.0, (500.0, 25.0), 5.0))
+    y, u, drift, integral = np.zeros(n), np.zeros(n), 0.0, 0.0
+    for k in range(n):
+        drift = 0.998 * drift + 0.06 * rng.standard_normal()
+        y[k] = 45.0 + plant.measure(interval * k) + drift + 0.1 * rng.standard_normal()
+        integral += 0.01 * interval * (93.0 - y[k])
+        u[k] = np.floor(np.clip(2.0 * (93.0 - y[k]) + integral, 0.0, 255.0))
+        plant.command(float(u[k]))
+    record = Record(time=interval * np.arange(n), measurement=y, command=u)
+    # The inverse of the law, -s/(2 s + 0.01), with a zero near 0 and a lag that the rows show.
+    model = TransferFunction(-0.02, (5000.0,), (200.0, 4.0))
+    left = y - 93.0 - response(model, record.time, replace(record.input(), initial=0.0))
+    slow = np.polyval(np.polyfit(record.time, left, 5), record.time)
+    assert read_backward(record, model, y - left + slow) > 0.8
+
+
 @pytest.mark.parametrize("command", ["slow", "random"])
 def test_a_command_from_outside_is_not_fed_back(command):
     """Nor is it where the process follows at once, so that its inverse explains the command."""

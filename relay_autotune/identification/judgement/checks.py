@@ -25,6 +25,9 @@ _ALIKE = 1e-6
 # Earlier samples that a controller's law may hold, a PID's with a filter, and the last samples of
 # a record that are looked at.
 _PAST, _MOST_CHANGES = 3, 20_000
+# Least number of means in a model's response, in which it then does not answer at once, and in the
+# record.
+_BLOCKS_OF_RESPONSE, _BLOCKS = 20.0, 100
 # Frequencies over which a spectrum is averaged.
 _NEAR = 5
 
@@ -44,18 +47,48 @@ def read_backward(record: Record, model: TransferFunction, fitted: FloatArray) -
     answers later: no more counts than the share of what the command's own past does not tell of
     it that the measurement does (Granger 1969).
 
+    All of it is asked of means of ever more samples, too, as long as these are short against the
+    response: from row to row, rounding and noise hide a slow law, as that of an integral is. What
+    the means leave of the command's power counts.
+
     :param record: any record.
     :param model: the model fitted to it.
     :param fitted: its measurement at the samples, NaN where it was not fitted, shape (n,).
     :return: None where samples are few, or the command moves no more often than a law has numbers.
     """
-    part = slice(-_MOST_CHANGES, None)
-    u, y = (x[part] - x.mean() for x in (record.command, record.measurement))
+    u, y = record.command[-_MOST_CHANGES:], record.measurement[-_MOST_CHANGES:]
+    e = np.nan_to_num(record.measurement - fitted)[-_MOST_CHANGES:]
+    longest = min(
+        model.response_time / (_BLOCKS_OF_RESPONSE * record.mean_interval), u.size / _BLOCKS
+    )
+    found = []
+    for size in (1 << k for k in range(max(int(longest), 1).bit_length())):
+        of, by, left = (
+            x[: x.size // size * size].reshape(-1, size).mean(axis=1) for x in (u, y, e)
+        )
+        share = _read_backward(of, by, left, size * record.mean_interval, model)
+        if share is not None:
+            found.append(share * float(np.var(of) / np.var(u)))
+    return max(found, default=None)
+
+
+def _read_backward(
+    u: FloatArray, y: FloatArray, e: FloatArray, interval: float, model: TransferFunction
+) -> float | None:
+    """Return what :func:`read_backward` does, of samples at one interval.
+
+    :param u: the command, shape (n,).
+    :param y: the measurement, shape (n,).
+    :param e: what the model leaves of it, shape (n,).
+    :param interval: s.
+    :param model: the model.
+    """
+    u, y = u - u.mean(), y - y.mean()
     numbers = 2 * _PAST + 2
     if u.size < _LEAST_SAMPLES or np.count_nonzero(np.diff(u)) <= numbers or not np.ptp(y) > 0.0:
         return None
     u_size, y_size = float(np.std(u)), float(np.std(y))
-    e = np.nan_to_num(record.measurement - fitted)[part][_PAST:] / y_size
+    e = e[_PAST:] / y_size
     u, y = u / u_size, y / y_size
     own = [u[_PAST - k : u.size - k] for k in range(1, _PAST + 1)]
     seen = [y[_PAST - k : y.size - k] for k in range(_PAST + 1)]
@@ -70,8 +103,8 @@ def read_backward(record: Record, model: TransferFunction, fitted: FloatArray) -
     if not alone @ alone > _ALIKE * now.size:
         return None
     follows = 1.0 - float(v @ v) / float(alone @ alone)
-    w = 2.0 * math.pi * np.fft.rfftfreq(e.size, record.mean_interval)[1:]
-    delay = np.exp(-1j * w * record.mean_interval) ** np.arange(_PAST + 1)[:, None]
+    w = 2.0 * math.pi * np.fft.rfftfreq(e.size, interval)[1:]
+    delay = np.exp(-1j * w * interval) ** np.arange(_PAST + 1)[:, None]
     answer, rest = factors[_PAST:-1] @ delay, 1.0 - factors[:_PAST] @ delay[1:]
 
     def power(x: FloatArray) -> FloatArray:
