@@ -11,6 +11,7 @@ from virtual_tune import tuned
 
 from relay_autotune.analysis import analyse
 from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
@@ -100,3 +101,21 @@ def test_a_step_that_begins_with_the_record_keeps_its_direction(zero, before):
     assert found.verdict is Verdict.TRUSTED
     assert found.model.model.gain == pytest.approx(1.0, rel=0.02)
     assert found.model.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.1)
+
+
+def test_a_step_from_a_known_command_begins_from_rest():
+    """The movement before it had stood for all of the answer, and a later sag for the response."""
+    rng, n = np.random.default_rng(61), 290
+    time = 0.00216 * np.arange(n)
+    u = PiecewiseConstant(np.zeros(1), np.array([15.0]), 0.0)
+    y = response(TransferFunction.fopdt(3.1, 0.034, 0.002), time, u)
+    y = y - 3.0 * np.maximum(1.0 - np.exp((0.15 - time) / 0.12), 0.0)
+    noise = np.zeros(n)
+    for k in range(1, n):
+        noise[k] = 0.6 * noise[k - 1] + 0.8 * rng.standard_normal()
+    # A sensor of coarse steps, whose noise grows with the speed.
+    y = 0.767 * np.round((y + noise * y / 42.0) / 0.767)
+    found = identify_waveform(
+        Record(time=time, measurement=y, command=np.full(n, 15.0), held_input=u)
+    )
+    assert found.model.gain == pytest.approx(3.1, rel=0.05)
