@@ -82,6 +82,9 @@ _HIDDEN = frozenset(("drift", "relaxation", "past", "ends"))
 _STEPS, _MOVES = 15, 4
 # Dead time on either side of a zero at 0, as a share of all times together.
 _ASIDE = 0.1
+# Farthest that drift, free state or past may move by itself, in ranges of the measurement: those
+# that cancel one another or the response explain anything.
+_FARTHEST = 10.0
 # Gain in a score that changes no choice.
 LITTLE = 0.5
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
@@ -251,7 +254,8 @@ class FitContext:
             "friction": not problem.friction or problem.dry_friction(found) >= least,
             "play": not problem.play or least <= problem.play_of(found) <= most,
         }
-        return [term for term, may_be in possible.items() if not may_be]
+        none = [term for term, may_be in possible.items() if not may_be]
+        return none + problem.terms_beyond(_FARTHEST, state.theta, found)
 
     def refit(self, problem: Problem, state: Trial) -> Candidate | None:
         """Fit a problem from the fit of a similar one; None as for :meth:`candidate`.

@@ -222,6 +222,27 @@ class Problem:
                 problem = replace(problem, ends=(low, high))
         return problem
 
+    def terms_beyond(self, most: float, theta: FloatArray, coefficients: FloatArray) -> list[str]:
+        """Return which of drift, free state and past move by more than a distance by themselves.
+
+        :param most: the distance, in ranges of the measurement.
+        :param theta: of a fit, shape (m,).
+        :param coefficients: of the fit, shape (k,); of several experiments none is asked.
+        """
+        if len(self.bounds) > 1 or not (self.drift or self.relaxation or self.past):
+            return []
+        count, columns = len(self.structure.powers), coefficients[:, None] * self.columns(theta)
+        last = len(columns) - 1 - self.drift - count * len(self._further)
+        places = {
+            "drift": slice(len(columns) - self.drift, None),
+            "relaxation": slice(count, last if self.relaxation else count),
+        }
+        if self.past:
+            first = len(columns) + self.places("past")[0]
+            places["past"] = slice(first, first + count)
+        moved = {term: columns[place].sum(axis=0) for term, place in places.items()}
+        return [term for term, x in moved.items() if float(np.ptp(x)) > most]
+
     def play_of(self, coefficients: FloatArray) -> float:
         """Return the command that a reversal loses in the play [u]; 0: not estimated.
 
