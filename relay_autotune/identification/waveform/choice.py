@@ -226,8 +226,9 @@ def _require_dynamics(context: FitContext, found: Sequence[Candidate]) -> None:
     if left < 0.5 * total and all(mean_square_left(c) > _WORSE * left**2 for c in found):
         raise IdentificationError(
             "the measurement follows the command within one sample, "
-            f"{digits(problem.shortest, 2)} s, and shows no dynamics: sample faster; if there are "
-            "none, an integral controller is enough"
+            f"{digits(problem.shortest, 2)} s, and shows no dynamics: sample faster; where a "
+            "controller made the command, move its set-point while recording; if there are no "
+            "dynamics, an integral controller is enough"
         )
 
 
