@@ -180,9 +180,11 @@ class Tab:
         """Return a value once it is true."""
         deadline = time.monotonic() + seconds
         while not (value := holds()):
-            shown = self.eval("document.body && document.body.innerText.slice(0, 600)")
-            assert time.monotonic() < deadline, f"{what} within {seconds} s; shown: {shown}"
-            time.sleep(0.02)
+            shown = "document.body && document.body.innerText.slice(0, 600)"
+            assert time.monotonic() < deadline, (
+                f"{what} within {seconds} s; shown: {self.eval(shown)}"
+            )
+            time.sleep(0.05)
         return value
 
     def click(self, selector: str) -> None:
