@@ -301,10 +301,9 @@ def test_no_draw_goes_beyond_what_the_samples_allow():
         assert np.abs(model(w) / process(w) - 1.0).max() < 0.5
 
 
-@pytest.mark.parametrize("noise", [0.02, 0.05])
-def test_a_zero_never_makes_a_fit_worse(noise):
+def test_a_zero_never_makes_a_fit_worse():
     """Where the zero is 0, dead time and zero cancel to first order, and a search may stay."""
-    record = steps(TransferFunction.sopdt(0.8, (2.0, 0.4), 0.0), noise=noise)
+    record = steps(TransferFunction.sopdt(0.8, (2.0, 0.4), 0.0), noise=0.05)
     plain, found = (
         identify(record, "waveform", Known(structure=name)) for name in ("sopdt", "sopdt_zero")
     )

@@ -167,9 +167,9 @@ def test_a_load_is_found_beside_white_noise_that_looks_coloured_by_chance():
     assert found.model.gain == pytest.approx(3.0, rel=0.05)
 
 
-@pytest.mark.parametrize(("early", "delay"), [(0.4, 8.0), (0.5, 10.0)])
-def test_gains_hold_where_a_load_after_the_only_move_was_a_part_of_the_response(early, delay):
-    """Two paths to one measurement; Ms was infinite and 26, and the gains were trusted."""
+def test_gains_hold_where_a_load_after_the_only_move_was_a_part_of_the_response():
+    """Two paths to one measurement; Ms was 26, and the gains were trusted."""
+    early, delay = 0.5, 10.0
 
     def answer(t):
         first, second = (1.0 - np.exp(-np.maximum(t - d, 0.0) / 8.0) for d in (3.0, 3.0 + delay))
