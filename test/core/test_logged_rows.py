@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from relay_autotune import DesignOptions, Record, analyse
+from relay_autotune import DesignOptions, Known, Record, analyse, identify
 from relay_autotune.errors import RecordError
 from relay_autotune.record.excitation import find_experiments
 from relay_autotune.tuning.of_record import warned_of_rows
@@ -143,6 +143,6 @@ def test_what_is_unseen_is_a_time():
 def test_where_nothing_is_unseen_nothing_is_said_of_it():
     """A method may read another K_u from the cycles than its model has."""
     record = replace(_in_loop(late=0), unseen=0.0)
-    found = analyse(record, alone=True)
-    higher = replace(found.model, ultimate_gain=2.0 * found.model.ultimate_gain)
+    found = identify(record, "waveform", Known(structure="fopdt"))
+    higher = replace(found, ultimate_gain=2.0 * found.ultimate_gain)
     assert warned_of_rows(higher, record) is higher

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from itertools import islice
 
 import numpy as np
@@ -149,6 +150,7 @@ def test_jitter_changes_little():
 # Proof.
 
 
+@cache
 def measured(process, step, noise_std=0.0, gains=GAINS, period=0.05):
     wanted = plan(Control(gains), PROCESS, step, period, noise_std)
     time = np.arange(int(wanted.duration / period)) * period
