@@ -22,6 +22,7 @@ import rclpy
 from forked import Forked, can_fork
 from rcl_interfaces.srv import GetParameters
 from rclpy.context import Context
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
@@ -39,6 +40,23 @@ RELIABLE = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.RELIABLE)
 
 # Deadline for a busy machine; a passing test does not wait for it.
 PATIENCE = 60.0
+
+
+class Onlooker(Node):
+    """A node of few parts: each wait for a message looks at all of them."""
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(
+            "onlooker", context=context, start_parameter_services=False, enable_rosout=False
+        )
+
+    def create_publisher(self, *given: Any, **named: Any) -> Any:
+        named["event_callbacks"] = PublisherEventCallbacks(use_default_callbacks=False)
+        return super().create_publisher(*given, **named)
+
+    def create_subscription(self, *given: Any, **named: Any) -> Any:
+        named["event_callbacks"] = SubscriptionEventCallbacks(use_default_callbacks=False)
+        return super().create_subscription(*given, **named)
 
 
 class Process:
@@ -122,7 +140,7 @@ class Rig:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain)
-        self.node = Node("onlooker", context=self.context)
+        self.node = Onlooker(self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
 
