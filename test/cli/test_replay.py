@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analysed import analysed_once, relay_record
+from analysed import analysed_anew, analysed_once, relay_record
 from made_bags import (
     REPOSITORY,
     START,
@@ -57,8 +57,9 @@ def write_bag(path, folder, *records):
     return path
 
 
-# The choice among structures takes seconds.
+# The choice among structures takes seconds, and so does the default rule.
 FOPDT = ("--structure", "fopdt")
+QUICK = (*FOPDT, "--rule", "imc")
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
@@ -72,6 +73,36 @@ def documents(text):
         raise AssertionError(f"{constant} is not JSON")
 
     return [json.loads(line, parse_constant=refuse) for line in text.splitlines()]
+
+
+def test_the_table_says_what_a_person_needs(tmp_path, capsys, monkeypatch):
+    # On a terminal it says meanwhile what the computation is at, so that it has to be one.
+    monkeypatch.setattr("relay_autotune.cli.jobs.analyse", analysed_anew)
+    monkeypatch.setattr(terminal, "PROGRESS_EVERY", 0.02)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    write_bag(tmp_path / "bag", tmp_path, relay_record())
+    status, out, err = run(capsys, tmp_path / "bag")
+    assert status == 0
+    *lines, left = err.split("\r\x1b[K")
+    assert left == ""
+    assert any(re.fullmatch(r"computing the model, .* s: comparing structures", x) for x in lines)
+    for word in (
+        "completed  (run-1)",
+        "700 samples",
+        "limit cycle",
+        "converged",
+        "process ",
+        "time constant",
+        "95 %:",
+        "ultimate gain",
+        "thyagarajan",
+        "ISA form",
+        "parallel form",
+        "Ms ",
+        "gain margin",
+    ):
+        assert word in out, word
+    assert max(map(len, out.splitlines()[1:])) < 100
 
 
 def test_the_document_has_the_numbers_of_the_core_to_the_last_digit(tmp_path, capsys):
@@ -128,42 +159,12 @@ def test_the_process_is_found(tmp_path, capsys):
     assert model["dead_time"] == pytest.approx(10.0, rel=0.02)
 
 
-def test_the_table_says_what_a_person_needs(tmp_path, capsys, monkeypatch):
-    # On a terminal it says meanwhile what the computation is at, so that it has to be one.
-    monkeypatch.setattr("relay_autotune.cli.jobs.analyse", analyse)
-    monkeypatch.setattr(terminal, "PROGRESS_EVERY", 0.02)
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    write_bag(tmp_path / "bag", tmp_path, relay_record())
-    status, out, err = run(capsys, tmp_path / "bag")
-    assert status == 0
-    *lines, left = err.split("\r\x1b[K")
-    assert left == ""
-    assert any(re.fullmatch(r"computing the model, .* s: comparing structures", x) for x in lines)
-    for word in (
-        "completed  (run-1)",
-        "700 samples",
-        "limit cycle",
-        "converged",
-        "process ",
-        "time constant",
-        "95 %:",
-        "ultimate gain",
-        "thyagarajan",
-        "ISA form",
-        "parallel form",
-        "Ms ",
-        "gain margin",
-    ):
-        assert word in out, word
-    assert max(map(len, out.splitlines()[1:])) < 100
-
-
 def test_two_experiments_are_two_entries_of_one_document(tmp_path, capsys):
     write_bag(tmp_path / "bag", tmp_path, relay_record(name="a"), relay_record(name="b"))
-    _, out, _ = run(capsys, "--json", *FOPDT, tmp_path / "bag")
+    _, out, _ = run(capsys, "--json", *QUICK, tmp_path / "bag")
     (found,) = documents(out)
     assert [e["experiment_id"] for e in found["experiments"]] == ["a", "b"]
-    _, out, _ = run(capsys, *FOPDT, tmp_path / "bag")
+    _, out, _ = run(capsys, *QUICK, tmp_path / "bag")
     assert "experiment 1 of 2" in out
     assert "experiment 2 of 2" in out
 
@@ -177,7 +178,7 @@ def test_an_experiment_that_did_not_end_well_has_a_model_but_no_gains(tmp_path, 
         tmp_path,
         relay_record(outcome=outcome, reason="the operator pressed the button"),
     )
-    status, out, _ = run(capsys, "--json", *FOPDT, tmp_path / "bag")
+    status, out, _ = run(capsys, "--json", *QUICK, tmp_path / "bag")
     (experiment,) = documents(out)[0]["experiments"]
     assert status == 1
     assert experiment["models"]
@@ -185,7 +186,7 @@ def test_an_experiment_that_did_not_end_well_has_a_model_but_no_gains(tmp_path, 
     assert experiment["recommended"] is None
     assert experiment["outcome"] == outcome.name.lower()
     assert experiment["reason"] == "the operator pressed the button"
-    status, out, err = run(capsys, *FOPDT, tmp_path / "bag")
+    status, out, err = run(capsys, *QUICK, tmp_path / "bag")
     assert status == 1
     # A line may end within it.
     assert " ".join((out + err).split()).count("the operator pressed the button") == 1
@@ -205,7 +206,7 @@ def test_a_bag_of_a_killed_node_gives_a_model_and_no_gains(tmp_path, capsys):
     bag = BagWriter(tmp_path / "bag", topics, start_ns=START, custom=facts)
     write_samples(bag, record)
     bag.flush()
-    status, out, err = run(capsys, "--json", *FOPDT, tmp_path / "bag")
+    status, out, err = run(capsys, "--json", *QUICK, tmp_path / "bag")
     (experiment,) = documents(out)[0]["experiments"]
     assert status == 1
     assert "unfinished recording" in err
@@ -223,7 +224,7 @@ def test_a_foreign_recording_of_a_relay(tmp_path, capsys):
         list(zip(record.time, record.command, strict=True)),
         ("/tank/level", "/tank/valve"),
     )
-    status, out, err = run(capsys, "--json", *FOPDT, tmp_path / "bag")
+    status, out, err = run(capsys, "--json", *QUICK, tmp_path / "bag")
     (experiment,) = documents(out)[0]["experiments"]
     assert status == 0
     assert "using --measurement /tank/level --command /tank/valve" in err
@@ -242,7 +243,7 @@ def test_other_methods_and_rules(tmp_path, capsys):
 
 def test_one_bad_bag_does_not_stop_the_others(tmp_path, capsys):
     good = write_bag(tmp_path / "good", tmp_path, relay_record())
-    status, out, err = run(capsys, "--json", tmp_path / "none", good)
+    status, out, err = run(capsys, "--json", *QUICK, tmp_path / "none", good)
     bad, fine = documents(out)
     assert status == 1
     assert bad["experiments"] == []
@@ -270,12 +271,12 @@ def step_csv(path, count=400, interval=0.5):
 def test_a_csv_and_the_bag_made_of_it_give_equal_numbers(tmp_path, capsys):
     path = step_csv(tmp_path / "step.csv")
     columns = ("--time", "Time (s)", "--measurement", "Level [m]", "--command", "Valve (%)")
-    status, from_csv, _ = run(capsys, "--json", path, *columns)
+    status, from_csv, _ = run(capsys, "--json", *QUICK, path, *columns)
     assert status == 0
     assert csv_to_bag.main([str(path), str(tmp_path / "bag"), *columns]) == 0
     assert "400 messages on /level, 400 on /valve" in capsys.readouterr().err
     topics = ("--measurement", "/level", "--command", "/valve")
-    status, from_bag, _ = run(capsys, "--json", tmp_path / "bag", *topics)
+    status, from_bag, _ = run(capsys, "--json", *QUICK, tmp_path / "bag", *topics)
     assert status == 0
     (a,), (b,) = documents(from_csv), documents(from_bag)
     # Float64 tells of no unit.
@@ -594,7 +595,7 @@ def test_nothing_is_imported_that_a_bag_of_ours_does_not_need(tmp_path):
 
 def test_a_reader_that_leaves_early_gets_no_traceback(tmp_path):
     write_bag(tmp_path / "bag", tmp_path, relay_record())
-    command = f"{sys.executable} -c '{_REPLAY}' --structure fopdt {tmp_path}/bag | true"
+    command = f"{sys.executable} -c '{_REPLAY}' {' '.join(QUICK)} {tmp_path}/bag | true"
     done = subprocess.run(
         ["bash", "-c", command], cwd=REPOSITORY, capture_output=True, text=True, timeout=120
     )

@@ -13,7 +13,7 @@ import pytest
 from made_bags import START, definition, experiment_message, serialize, write_samples
 from sampled_relay import simulate_sampled_relay
 
-from relay_autotune.analysis import analyse, analyse_jointly
+from relay_autotune.analysis import analyse_jointly
 from relay_autotune.bag.definitions import EXPERIMENT, Definition
 from relay_autotune.bag.writer import BagWriter, Topic
 from relay_autotune.cli import replay
@@ -55,11 +55,11 @@ def test_known_facts_reach_the_method(tmp_path, capsys):
     record = unbiased()
     bag = write_bag(tmp_path / "bag", tmp_path, record)
     known = ("--gain", "1.65", "--dead-time", "10", "--structure", "fopdt")
-    status, (found,), _ = run(capsys, "--method", "chang", *known, bag)
+    status, (found,), _ = run(capsys, "--method", "chang", "--rule", "imc", *known, bag)
     assert status == 0
     model = found["experiments"][0]["models"][0]
     assert (model["method"], model["gain"], model["dead_time"]) == ("chang", 1.65, 10.0)
-    expected = analyse(record, method="chang", known=Known(1.65, 10.0, "fopdt"), alone=True).model
+    expected = identify(record, "chang", Known(1.65, 10.0, "fopdt"))
     assert model["time_constants"] == [t.real for t in expected.model.time_constants]
     assert model["time_constants"] == pytest.approx([20.0], rel=0.05)
 

@@ -48,6 +48,9 @@ def relay_record(
     )
 
 
+_OF_NO_MODEL: dict[str, Any] = {
+    "experiment_id": "", "start": 0.0, "outcome": Outcome.COMPLETED, "reason": "", "why": NONE
+}  # fmt: skip
 _MODELS: dict[bytes, Identification] = {}
 _FOUND: dict[bytes, Analysis] = {}
 
@@ -59,7 +62,7 @@ def identified_once(record: Record, *asked: Any) -> Identification:
     :param asked: further arguments of `identify`.
     """
     # Whose test it was, when, and how it is said to have ended make no other model.
-    key = pickle.dumps((replace(record, experiment_id="", start=0.0, reason="", why=NONE), asked))
+    key = pickle.dumps((replace(record, **_OF_NO_MODEL), asked))
     if key not in _MODELS:
         _MODELS[key] = identify(record, *asked)
     return _MODELS[key]
@@ -79,6 +82,21 @@ def analysed_once(record: Record, *, tell: object = None, **task: Any) -> Analys
         with patch("relay_autotune.analysis.identify", identified_once):
             _FOUND[key] = analyse(record, **task)
     return _FOUND[key]
+
+
+def analysed_anew(record: Record, **task: Any) -> Analysis:
+    """Analyse a record whatever was found before, and remember what is found.
+
+    :param record: the experiment.
+    :param task: further arguments of `analyse`.
+    """
+    with (
+        patch(f"{__name__}._MODELS", {}) as models,
+        patch("relay_autotune.analysis.identify", identified_once),
+    ):
+        found = analyse(record, **task)
+    _MODELS.update(models)
+    return found
 
 
 @functools.cache
