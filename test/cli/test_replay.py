@@ -150,15 +150,6 @@ def test_the_document_has_the_numbers_of_the_core_to_the_last_digit(tmp_path, ca
     assert cycle["cycles"] >= 3
 
 
-def test_the_process_is_found(tmp_path, capsys):
-    write_bag(tmp_path / "bag", tmp_path, relay_record())
-    _, out, _ = run(capsys, "--json", tmp_path / "bag")
-    model = documents(out)[0]["experiments"][0]["models"][0]
-    assert model["gain"] == pytest.approx(1.65, rel=0.02)
-    assert model["time_constants"][0] == pytest.approx(20.0, rel=0.03)
-    assert model["dead_time"] == pytest.approx(10.0, rel=0.02)
-
-
 def test_two_experiments_are_two_entries_of_one_document(tmp_path, capsys):
     write_bag(tmp_path / "bag", tmp_path, relay_record(name="a"), relay_record(name="b"))
     _, out, _ = run(capsys, "--json", *QUICK, tmp_path / "bag")

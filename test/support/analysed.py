@@ -85,11 +85,7 @@ def analysed_once(record: Record, *, tell: object = None, **task: Any) -> Analys
 
 
 def analysed_anew(record: Record, **task: Any) -> Analysis:
-    """Analyse a record whatever was found before, and remember what is found.
-
-    :param record: the experiment.
-    :param task: further arguments of `analyse`.
-    """
+    """Analyse a record whatever was found before, and remember its models."""
     with (
         patch(f"{__name__}._MODELS", {}) as models,
         patch("relay_autotune.analysis.identify", identified_once),
