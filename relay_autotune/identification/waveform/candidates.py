@@ -82,8 +82,8 @@ _HIDDEN = frozenset(("drift", "relaxation", "past", "ends"))
 _STEPS, _MOVES = 15, 4
 # Dead time on either side of a zero at 0, as a share of all times together.
 _ASIDE = 0.1
-# Farthest that drift, free state or past may move by itself, in ranges of the measurement: those
-# that cancel one another or the response explain anything.
+# Farthest that drift, free state or past may move by itself, in ranges of the measurement or of
+# the response: those that cancel one another explain anything.
 _FARTHEST = 10.0
 # Gain in a score that changes no choice.
 LITTLE = 0.5

@@ -223,9 +223,11 @@ class Problem:
         return problem
 
     def terms_beyond(self, most: float, theta: FloatArray, coefficients: FloatArray) -> list[str]:
-        """Return which of drift, free state and past move by more than a distance by themselves.
+        """Return which of drift, free state and past move by themselves more than allowed.
 
-        :param most: the distance, in ranges of the measurement.
+        :param most: allowed, in times of the measurement's or the response's range, whichever is
+            larger: where the first command is none at which the process rests, both are of the
+            response's size.
         :param theta: of a fit, shape (m,).
         :param coefficients: of the fit, shape (k,); of several experiments none is asked.
         """
@@ -240,8 +242,12 @@ class Problem:
         if self.past:
             first = len(columns) + self.places("past")[0]
             places["past"] = slice(first, first + count)
-        moved = {term: columns[place].sum(axis=0) for term, place in places.items()}
-        return [term for term, x in moved.items() if float(np.ptp(x)) > most]
+
+        def moved(place: slice) -> float:
+            return float(np.ptp(columns[place].sum(axis=0)))
+
+        allowed = most * max(1.0, moved(slice(count)))
+        return [term for term, place in places.items() if moved(place) > allowed]
 
     def play_of(self, coefficients: FloatArray) -> float:
         """Return the command that a reversal loses in the play [u]; 0: not estimated.
