@@ -117,7 +117,7 @@ def read_columns(path: Path, columns: Sequence[str] | None = None) -> dict[str, 
     :raises BagError: if the file cannot be read, or holds anything but numbers.
     """
     with _table(path) as table:
-        time = _time(path, table.names, Selection(), ())
+        time, _ = _time(path, table, Selection(), ())
         assert time is not None
         names = table.names if columns is None else columns
         places = [_named(path, table.names, name) for name in names]
@@ -147,7 +147,7 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
     :raises BagError: if the file cannot be read, or holds anything but numbers.
     """
     with _table(path) as table:
-        time, pair, said = _choose(path, table.names, wanted)
+        time, pair, said = _choose(path, table, wanted)
         times, columns = table.columns(time, pair)
     values, lines = np.array(columns), table.lines
     notes = [*table.notes, *said]
@@ -167,12 +167,8 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
     else:
         assert time is not None
         name = table.names[time]
-        if time and wanted.time is None:
-            notes.append(f"the time is taken from the column {name!r}")
         unit = wanted.time_unit or table.units.get(name)
         time_ns, dated = _nanoseconds(path, name, times, unit, notes)
-        if wanted.time is None and not is_time(name):
-            _check_rises(path, name, time_ns)
         unset = time_ns < EPOCH * 1e9
         if dated and 0 < np.count_nonzero(unset) <= _UNSET * unset.size:
             notes.append(
@@ -372,19 +368,6 @@ def _unit_of(name: str) -> str | None:
     return last if last.lower() in _UNITS else None
 
 
-def _check_rises(path: Path, name: str, time_ns: IntArray) -> None:
-    """Refuse a column that is not called a time and does not rise.
-
-    :raises SelectionError: if so.
-    """
-    if np.count_nonzero(np.diff(time_ns) > 0) < 0.5 * (time_ns.size - 1):
-        raise SelectionError(
-            f"{path}: the column {name!r} does not rise from row to row, so it is no time; name "
-            "that with --time NAME, or, if there is none, give the sampling period with "
-            "--period S"
-        )
-
-
 def _recordings(time_ns: IntArray) -> list[int]:
     """Return the first row of each recording, and the number of rows.
 
@@ -403,19 +386,20 @@ def _recordings(time_ns: IntArray) -> list[int]:
 
 
 def _choose(
-    path: Path, names: Sequence[str], wanted: Selection
+    path: Path, table: TextTable, wanted: Selection
 ) -> tuple[int | None, list[int], list[str]]:
     """Return the places of the time, None without one, and of measurement and command, and notes.
 
     :raises SelectionError: if neither flags nor names tell which they are.
     """
-    given = (wanted.measurement, wanted.command)
+    names, given = table.names, (wanted.measurement, wanted.command)
     pair = [_named(path, names, name) for name in given if name is not None]
-    time = _time(path, names, wanted, pair)
+    time, notes = _time(path, table, wanted, pair)
     rest = [k for k in range(len(names)) if k != time]
     if not pair and len(rest) == 2:
         pair = rest
-    choices, notes = _choices([names[k] for k in rest], given), doubts_about(*given)
+    notes += doubts_about(*given)
+    choices = _choices([names[k] for k in rest], given)
     if len(pair) < 2 and len(choices) == 1:
         ((y, u, named),) = choices
         pair = [names.index(y), names.index(u)]
@@ -439,11 +423,6 @@ def _choose(
             f"{path} has {len(names)} columns: {listed(names)}{least}",
             [(flags_of(y, u), "as their names say" * named) for y, u, named in choices],
         )
-    if time in pair and wanted.time is None:
-        raise SelectionError(
-            f"{path} has no column that is named as a time: {listed(names)}; name it with --time "
-            "NAME, or, if there is none, give the sampling period with --period S"
-        )
     for at in pair:
         _named(path, names, names[at])
     if len({time, *pair}) < 3:
@@ -455,11 +434,15 @@ def _choose(
     return time, pair, notes
 
 
-def _time(path: Path, names: Sequence[str], wanted: Selection, taken: Sequence[int]) -> int | None:
-    """Return the place of the time; None: rows have none, and come one period after another.
+def _time(
+    path: Path, table: TextTable, wanted: Selection, taken: Sequence[int]
+) -> tuple[int | None, list[str]]:
+    """Return the place of the time, and notes; None: rows come one period after another.
 
     :param taken: places of columns that are named as something else.
+    :raises SelectionError: if no column is named as a time, or is the first or only one to rise.
     """
+    names = table.names
     if wanted.period is not None:
         if wanted.time is not None:
             raise SelectionError(
@@ -469,12 +452,27 @@ def _time(path: Path, names: Sequence[str], wanted: Selection, taken: Sequence[i
             raise SelectionError(
                 f"--period {wanted.period:g} is no time from row to row; expected > 0"
             )
-        return None
+        return None, []
     if wanted.time is not None:
-        return _named(path, names, wanted.time)
+        return _named(path, names, wanted.time), []
     # The first column, unless only another one is called so.
     called_so = [k for k, name in enumerate(names) if k not in taken and is_time(name)]
-    return called_so[0] if called_so and not is_time(names[0]) else 0
+    if is_time(names[0]) or len(names) < 3:
+        return 0, []
+    if called_so:
+        return called_so[0], [f"the time is taken from the column {names[called_so[0]]!r}"]
+    rising = [k for k in table.looks[1] if k not in taken and role_of(names[k]) is None]
+    if rising[:1] == [0]:
+        return 0, []
+    if len(rising) == 1:
+        name = names[rising[0]]
+        return rising[0], [f"the time is taken from the column {name!r}, which alone rises"]
+    others = f" as {listed([names[k] for k in rising])} do" * bool(rising)
+    raise SelectionError(
+        f"{path}: the column {names[0]!r} does not rise from row to row{others}, so it is no "
+        "time; name that with --time NAME, or, if there is none, give the sampling period with "
+        "--period S"
+    )
 
 
 def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[tuple[str, str, bool]]:

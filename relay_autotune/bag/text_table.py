@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, timezone
+from functools import cached_property
 from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import BinaryIO, TextIO
@@ -26,6 +27,7 @@ import numpy as np
 
 from relay_autotune.bag.arrays import FloatArray, IntArray
 from relay_autotune.bag.limits import LARGEST_TEXT, LONGEST_LINE
+from relay_autotune.bag.source import open_regular
 from relay_autotune.errors import BagError, visible
 
 # Each is preferred to those after it where both make as many numbers: beside a semicolon, a tab
@@ -40,6 +42,8 @@ _LONGEST_HEAD = 1000
 _SHOWN = 60
 # Largest share of rows with text in place of a number that are left out; more are a fault.
 _DAMAGED = 0.02
+# Largest share of rows at which a time goes back, and share of rows beyond which it rises.
+_BACK, _RISING = 0.05, 0.5
 _COMMAS = (
     ": where commas separate columns, a number has none; save the table with decimal points and "
     "without separators of thousands, or with semicolons between columns"
@@ -124,6 +128,36 @@ class TextTable:
         """True if rows of numbers follow each other; one may be a sentence with numbers in it."""
         first = [cells for _, cells in self._waiting[:2]]
         return len(first) == 2 and _are_data(*first)
+
+    @cached_property
+    def looks(self) -> tuple[list[int], list[int]]:
+        """Return the places of the columns that are not constant, and of those that rise.
+
+        The file is read once more for it. A column that rises may begin anew at a few rows.
+        """
+        with open_regular(self._path) as file:
+            return TextTable(self._path, file)._looks()
+
+    def _looks(self) -> tuple[list[int], list[int]]:
+        columns = range(len(self.names))
+        last, rises, falls = ([value for _ in columns] for value in (math.nan, 0.0, 0.0))
+        asked, count = list(columns), 0
+        for count, (line, row) in enumerate(self._rows()):
+            for at in tuple(asked):
+                cell = row[at] if at < len(row) else ""
+                date = None if _is_number(cell) else _date(cell)
+                try:
+                    value = float(date[0]) if date else self._number(line, at, cell)[0]
+                except BagError:
+                    continue
+                rises[at] += value > last[at]
+                falls[at] += value < last[at]
+                last[at] = last[at] if math.isnan(value) else value
+                if falls[at] > 1.0 + _BACK * (count + 1):
+                    asked.remove(at)
+        moving = [at for at in columns if rises[at] + falls[at]]
+        limits = _BACK * count, _RISING * count
+        return moving, [at for at in asked if falls[at] <= limits[0] and rises[at] > limits[1]]
 
     def _encoding(self, first: bytes) -> str:
         if first[:2] in (b"\xff\xfe", b"\xfe\xff"):

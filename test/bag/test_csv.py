@@ -683,3 +683,14 @@ def test_a_command_that_is_read_seldom_may_have_moved_since_its_last_reading(
     found = read_experiments(write(tmp_path / "a.csv", text), Selection("y", "u", "time"))
     expected = unseen or (0.0 if own_rows else 1.0)
     assert [record.unseen for record in found.experiments] == [expected]
+
+
+def test_the_time_may_be_the_one_column_that_rises(tmp_path):
+    cells = [line(k).split(",") for k in range(40)]
+    text = "".join(f"4,{y},{u},{t}\n" for t, y, u in cells)
+    found = read_experiments(write(tmp_path / "a.csv", text), Selection("2", "3"))
+    assert found.experiments[0].time.tolist() == [0.5 * k for k in range(40)]
+    assert "the time is taken from the column '4', which alone rises" in found.notes
+    two = write(tmp_path / "b.csv", "".join(f"{y},{u},{t},{t}\n" for t, y, u in cells))
+    with pytest.raises(SelectionError, match=r"'1' does not rise .*as '3', '4' do, so it is no"):
+        read_experiments(two)
