@@ -399,8 +399,17 @@ def _choose(
     if not pair and len(rest) == 2:
         pair = rest
     notes += doubts_about(*given)
-    choices = _choices([names[k] for k in rest], given)
-    if len(pair) < 2 and len(choices) == 1:
+    choices, still, sure = [], [], False
+    if len(pair) < 2:
+        moving = {names[k] for k in table.looks[0]}
+        still = [names[k] for k in rest if names[k] not in moving]
+        # Of a command that never changes it may be told what it was before.
+        held = still if wanted.command_before is None else ()
+        free = [names[k] for k in rest]
+        choices = _choices(free, given, (still, held))
+        # Where another pair is constant, the one that moves may be of something else.
+        sure = len(choices) == 1 and choices == _choices(free, given, ((), ()))
+    if sure:
         ((y, u, named),) = choices
         pair = [names.index(y), names.index(u)]
         why = "as their names say" if named else "since no other pair is possible"
@@ -418,7 +427,9 @@ def _choose(
             least = "; expected a name of its own for each, in the line just above the numbers"
         elif len(names) >= 3:
             other = "" if time is None else f", and --time NAME if it is not {names[time]!r}"
-            least = f"; name two of them with --measurement NAME --command NAME{other}, such as"
+            least = f"; name two of them with --measurement NAME --command NAME{other}"
+            least += f" (constant, empty or text: {listed(still)})" * bool(still)
+            least += ", such as" * bool(choices)
         raise SelectionError(
             f"{path} has {len(names)} columns: {listed(names)}{least}",
             [(flags_of(y, u), "as their names say" * named) for y, u, named in choices],
@@ -475,19 +486,22 @@ def _time(
     )
 
 
-def _choices(names: Sequence[str], given: Sequence[str | None]) -> list[tuple[str, str, bool]]:
+def _choices(
+    names: Sequence[str], given: Sequence[str | None], without: Sequence[Sequence[str]]
+) -> list[tuple[str, str, bool]]:
     """Return columns that may be measurement and command, and whether both are named so.
 
     :param names: of the columns that are free.
     :param given: measurement and command, as far as they are named.
+    :param without: columns that cannot be the measurement, and the command, unless they are given.
     """
     names = list(dict.fromkeys(names))
     roles = {name: role_of(name) for name in names}
     hints = [[n for n in names if roles[n] == role] for role in (MEASUREMENT, COMMAND)]
     unclear = [n for n in names if roles[n] is None]
     pair = [
-        [name] if name is not None else hinted or unclear
-        for name, hinted in zip(given, hints, strict=True)
+        [name] if name is not None else [n for n in hinted or unclear if n not in out]
+        for name, hinted, out in zip(given, hints, without, strict=True)
     ]
     found = [(y, u, all(hints)) for y in pair[0] for u in pair[1] if y != u]
     # Of a plant's columns, those of one loop belong together.
@@ -511,13 +525,19 @@ def _order(
     roles = [role_of(name) for name in names]
     if set(roles) != {MEASUREMENT, COMMAND}:
         # One name alone may be that of a part on either side: "T_out" and "flow", or "Ausgang".
-        in_steps = _steps(first), _steps(second)
-        if in_steps[0] != in_steps[1]:
-            return in_steps[0], "since it moves in steps"
+        for looks, how in ((_rests, "never changes"), (_steps, "moves in steps")):
+            if looks(first) != looks(second):
+                return looks(first), f"since it {how}"
     if roles[0] == roles[1]:
         return False, "since it comes last"
     swapped = roles[0] == COMMAND or roles[1] == MEASUREMENT
     return swapped, "as their names say" if swapped else ""
+
+
+def _rests(values: FloatArray) -> bool:
+    """Return whether a signal has one value at most."""
+    there = values[~np.isnan(values)]
+    return not np.any(there != there[:1])
 
 
 def _steps(values: FloatArray) -> bool:

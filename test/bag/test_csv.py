@@ -114,7 +114,8 @@ def test_the_examples_of_names_are_true():
 
 
 def test_one_column_that_is_left_is_the_command_only_if_no_other_is(tmp_path):
-    text = "t,SP,PV,A,B\n" + "\n".join(line(k).replace(",", ",40,", 1) + ",7" for k in range(20))
+    rows = (line(k).replace(",", ",40,", 1) + f",{k % 3}" for k in range(20))
+    text = "t,SP,PV,A,B\n" + "\n".join(rows)
     with pytest.raises(SelectionError, match="name two of them") as refused:
         read_experiments(write(tmp_path / "a.csv", text))
     assert str(refused.value).count("--measurement PV --command") == 2
@@ -683,6 +684,34 @@ def test_a_command_that_is_read_seldom_may_have_moved_since_its_last_reading(
     found = read_experiments(write(tmp_path / "a.csv", text), Selection("y", "u", "time"))
     expected = unseen or (0.0 if own_rows else 1.0)
     assert [record.unseen for record in found.experiments] == [expected]
+
+
+def test_a_column_that_is_constant_or_empty_is_not_proposed(tmp_path):
+    text = "Time,Speed,Temp,Heater,Fan\n" + "".join(
+        f"{k},,{k % 7},{k // 5 % 2},30\n" for k in range(20)
+    )
+    with pytest.raises(SelectionError, match="name two of them") as refused:
+        read_experiments(write(tmp_path / "a.csv", text))
+    assert str(refused.value).splitlines()[1:] == [
+        "  --measurement Temp --command Heater  # as their names say"
+    ]
+    # No other column stands in for the only ones whose names tell a role.
+    path = write(tmp_path / "b.csv", text.replace("Temp,Heater", "Sway,Heave"))
+    with pytest.raises(SelectionError, match=r"\(constant, .*: 'Speed', 'Fan'\)$") as refused:
+        read_experiments(path)
+    assert "\n" not in str(refused.value)
+    # Of a command that never changes it may be told what it was before.
+    text = text.replace("Heater", "Ref")
+    (record,) = read_experiments(
+        write(tmp_path / "c.csv", text), Selection("Temp", command_before=0.0, end=99.0)
+    ).experiments
+    assert set(record.command.tolist()) == {30.0}
+
+
+def test_of_three_columns_the_one_that_never_changes_is_the_command(tmp_path):
+    text = "".join(f"{k},255,{k % 7}\n" for k in range(20))
+    with pytest.raises(BagError, match=r"the command 2 never changes.*--command-before"):
+        read_experiments(write(tmp_path / "a.csv", text))
 
 
 def test_the_time_may_be_the_one_column_that_rises(tmp_path):
