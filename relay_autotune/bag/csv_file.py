@@ -505,8 +505,13 @@ def _choices(
     ]
     found = [(y, u, all(hints)) for y in pair[0] for u in pair[1] if y != u]
     # Of a plant's columns, those of one loop belong together.
-    of_one = [(y, u, named) for y, u, named in found if tag_of(y) == tag_of(u) != ""]
-    return (of_one or found)[:_MOST_CHOICES]
+    tags = {name: tag_of(name) for pool in pair for name in pool}
+    of_one = [(y, u, named) for y, u, named in found if tags[y] == tags[u] != ""]
+    alike = [
+        (y, u, named) for y, u, named in found if tags[u] and f" {tags[y]}".endswith(f" {tags[u]}")
+    ]
+    # One pair may be alike by chance.
+    return (of_one or alike * (len(alike) > 1) or found)[:_MOST_CHOICES]
 
 
 def _order(

@@ -55,10 +55,14 @@ _OF_SENSORS = re.compile(r"(deg ?|°)[CFK]|[kMm]?Pa|m?bar|psi|rpm")
 
 def words_of(name: str) -> frozenset[str]:
     """Return the words of a name without its unit, without digits and accents, in lower case."""
-    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", without_unit(name))
-    plain = unicodedata.normalize("NFKD", apart.casefold())
+    plain = unicodedata.normalize("NFKD", _apart(name).casefold())
     letters = "".join(c for c in plain if not unicodedata.combining(c))
     return frozenset(re.findall(r"[^\W\d_]+", letters))
+
+
+def _apart(name: str) -> str:
+    """Return a name without its unit, and with a space before a capital within a word."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", without_unit(name))
 
 
 def role_of(name: str) -> str | None:
@@ -82,10 +86,12 @@ def role_of(name: str) -> str | None:
 def tag_of(name: str) -> str:
     """Return a name without the word that says its role, with digits; empty: it has no other.
 
-    >>> tag_of("TIC-101.PV (degC)"), tag_of("OUT TIC-101"), tag_of("Heater (%)")
+    >>> tag_of("TIC-101.PV (degC)"), tag_of("OUT TIC101"), tag_of("Heater (%)")
     ('tic 101', 'tic 101', '')
+    >>> tag_of("yEst"), tag_of("uEst"), tag_of("T1"), tag_of("Q1")
+    ('est', 'est', '1', '1')
     """
-    words = re.findall(r"[^\W_]+", without_unit(name).casefold())
+    words = re.findall(r"[^\W\d_]+|\d+", _apart(name).casefold())
     return " ".join(word for word in words if role_of(word) is None)
 
 

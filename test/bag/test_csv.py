@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import doctest
 import math
+import re
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
@@ -712,6 +713,45 @@ def test_of_three_columns_the_one_that_never_changes_is_the_command(tmp_path):
     text = "".join(f"{k},255,{k % 7}\n" for k in range(20))
     with pytest.raises(BagError, match=r"the command 2 never changes.*--command-before"):
         read_experiments(write(tmp_path / "a.csv", text))
+
+
+def test_columns_of_two_experiments_side_by_side_are_proposed_in_pairs(tmp_path):
+    slow = [f"{math.sin(0.01 * k):.4f}" for k in range(400)]
+    text = "uEst,uVal,yEst,yVal,Ts,\n" + "".join(
+        f"{y},{k // 50 % 2},{k // 40 % 3},{y},{'' if k else 4},\n" for k, y in enumerate(slow)
+    )
+    path = write(tmp_path / "a.csv", text)
+    with pytest.raises(SelectionError, match=r"'uEst' does not rise from row to row, so .*--per"):
+        read_experiments(path)
+    with pytest.raises(SelectionError, match="name two of them") as refused:
+        read_experiments(path, Selection(period=4.0))
+    pairs = [line.split("--")[1:] for line in str(refused.value).splitlines()[1:]]
+    assert [[flag.split()[1] for flag in pair] for pair in pairs] == [
+        ["yEst", "uEst"],
+        ["yVal", "uVal"],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("names", "pairs"),
+    [
+        ("Time,Q1,Q2,T1,T2", [("T1", "Q1"), ("T2", "Q2")]),
+        ("Time,PWM_M1,PWM_M2,I_M1,I_M2", [("I_M1", "PWM_M1"), ("I_M2", "PWM_M2")]),
+        # One pair may be alike by chance.
+        (
+            "Time,Heater,Cold Pump,Very cold level,Level",
+            [(y, u) for y in ("'Very cold level'", "Level") for u in ("Heater", "'Cold Pump'")],
+        ),
+    ],
+)
+def test_a_command_is_proposed_with_the_measurement_of_its_own_suffix(tmp_path, names, pairs):
+    rows = (f"{k},{k // 5 % 2},{k // 9},{k % 7},{k % 5}\n" for k in range(60))
+    text = names + "\n" + "".join(rows)
+    with pytest.raises(SelectionError, match="name two of them") as refused:
+        read_experiments(write(tmp_path / "a.csv", text))
+    lines = str(refused.value).splitlines()[1:]
+    found = [re.findall(r"--\w+ ('[^']*'|\S+)", line) for line in lines]
+    assert [tuple(pair) for pair in found] == pairs
 
 
 def test_the_time_may_be_the_one_column_that_rises(tmp_path):
