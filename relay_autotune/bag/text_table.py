@@ -193,6 +193,8 @@ class TextTable:
             (k + 1 for _, row in self._waiting for k, c in enumerate(row) if c), default=0
         )
         above = [(line, _bare(cells, filled)) for line, cells in rows[:data]]
+        if above and not self._is_header(above[-1][1], filled):
+            above[-1] = (above[-1][0], self._apart(above[-1][1], filled))
         fits = [self._is_header(cells, filled) for _, cells in above]
         if not fits or not fits[-1]:
             if not width:
@@ -250,6 +252,19 @@ class TextTable:
         # Names with spaces in them make more cells than there are columns.
         fits = len(cells) == width if self._separator == " " else len(cells) >= max(width, 2)
         return fits and sum(map(bool, cells)) >= 2 and not _is_data(cells)
+
+    def _apart(self, cells: list[str], width: int) -> list[str]:
+        """Return the cells of a line, or its names if another mark than in rows separates them.
+
+        Spaces do not count, since they separate the words of a title, too.
+        """
+        text = self._separator.join(cells)
+        for mark in ",;\t".replace(self._separator, ""):
+            names = [name.strip() for name in text.split(mark)]
+            if len(names) == width > 1 and all(names) and not _is_data(names):
+                self.notes.append(f"the names of columns are separated by {_SEPARATORS[mark]}")
+                return names
+        return cells
 
     def _rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield each row of numbers with its line number."""

@@ -763,3 +763,18 @@ def test_the_time_may_be_the_one_column_that_rises(tmp_path):
     two = write(tmp_path / "b.csv", "".join(f"{y},{u},{t},{t}\n" for t, y, u in cells))
     with pytest.raises(SelectionError, match=r"'1' does not rise .*as '3', '4' do, so it is no"):
         read_experiments(two)
+
+
+@pytest.mark.parametrize(("between", "separator"), [(",", "\t"), (", ", ";"), (";", " ")])
+def test_names_may_be_separated_otherwise_than_the_rows(tmp_path, between, separator):
+    head = between.join(("Time (s)", "Actual temperature (degC)", "Heater (%)"))
+    body = "\n".join(line(k, separator) for k in range(20))
+    found = read_experiments(write(tmp_path / "a.csv", f"{head}\n{body}"))
+    assert same_as_plain(tmp_path, found).units == {"y": "degC", "u": "%"}
+    assert any("the names of columns are separated by " in note for note in found.notes)
+
+
+def test_the_words_of_a_title_are_no_names(tmp_path):
+    body = "\n".join(line(k) for k in range(20))
+    found = read_experiments(write(tmp_path / "a.csv", f"Step of today\n{body}"))
+    assert found.notes[0] == "there is no header line; the columns are called '1', '2', '3'"
