@@ -14,6 +14,7 @@ import csv
 import io
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -40,8 +41,10 @@ _FIRST = 64 << 10
 _LONGEST_HEAD = 1000
 # Characters of a line that are shown.
 _SHOWN = 60
-# Largest share of rows with text in place of a number that are left out; more are a fault.
+# Largest share of rows with text in place of a number, or with another number of cells, that are
+# left out, as a serial link garbles a line now and then; more are a fault.
 _DAMAGED = 0.02
+_UNEVEN = "have another number of cells"
 # Largest share of rows at which a time goes back, and share of rows beyond which it rises.
 _BACK, _RISING = 0.05, 0.5
 _COMMAS = (
@@ -277,15 +280,7 @@ class TextTable:
             if cells[0].startswith(_REMARKS) or (self._head and cells == self._head):
                 left_out += 1
                 continue
-            cells = self._joined(cells)
-            # A separator at a line's end is no cell.
-            if any(cells[len(self.names) :]):
-                raise BagError(
-                    f"{self._path}, line {line}: {len(cells)} cells, but {len(self.names)} "
-                    f"columns have a name; a decimal comma, or a separator within a text, would "
-                    f"make such a line"
-                )
-            yield line, cells
+            yield line, self._joined(cells)
         if left_out:
             self.notes.append(f"{left_out} lines between the rows hold remarks and are left out")
 
@@ -299,24 +294,36 @@ class TextTable:
         times = Times()
         values: list[list[float]] = [[] for _ in places]
         lines: list[int] = []
-        untimed, damaged = 0, []
+        untimed, ragged, width = 0, False, len(self.names)
+        # The number of rows with each fault, and the first of them.
+        counts: Counter[str] = Counter()
+        faults: dict[str, BagError] = {}
         for line, row in self._rows():
             stamp = "" if time is None or time >= len(row) else row[time]
             if time is not None and stamp.lower() in _MISSING:
                 untimed += 1
                 continue
+            # Where more rows are short, their last cells are empty.
+            short = len(row) <= max(places, default=0)
+            ragged |= short and counts[_UNEVEN] >= int(_DAMAGED * len(lines))
+            fault = _UNEVEN
             try:
+                # A separator at a line's end is no cell.
+                if any(row[width:]) or (short and not ragged):
+                    raise self._uneven(line, len(row))
+                fault = "hold something else than numbers"
                 found = [self._value(line, row, at) for at in places]
                 if time is not None:
                     self._stamp(line, time, stamp, times)
             except BagError as error:
-                damaged.append(error)
+                counts[fault] += 1
+                faults.setdefault(fault, error)
                 continue
             for column, number in zip(values, found, strict=True):
                 column.append(number)
             lines.append(line)
-        if damaged and len(damaged) > _DAMAGED * len(lines):
-            raise damaged[0]
+        if counts.total() > _DAMAGED * len(lines):
+            raise next(iter(faults.values()))
         self._settle_order(times)
         if len(lines) < 2:
             raise BagError(f"{self._path} has fewer than two rows of numbers; expected more")
@@ -336,13 +343,18 @@ class TextTable:
             self.notes.append("a comma within a number is taken as the decimal point")
         if untimed:
             self.notes.append(f"{untimed} rows without a time are left out")
-        if damaged:
-            self.notes.append(
-                f"{len(damaged)} rows hold something else than numbers and are left out, "
-                f"the first: {str(damaged[0]).removeprefix(f'{self._path}, ')}"
-            )
+        for fault, earliest in faults.items():
+            first = str(earliest).removeprefix(f"{self._path}, ")
+            self.notes.append(f"{counts[fault]} rows {fault} and are left out, the first: {first}")
         self.lines = np.array(lines, dtype=np.int64)
         return times, [np.array(column) for column in values]
+
+    def _uneven(self, line: int, count: int) -> BagError:
+        hint = "; a decimal comma, or a separator within a text, would make such a line"
+        return BagError(
+            f"{self._path}, line {line}: {count} cells, but {len(self.names)} columns have a name"
+            + hint * (count > len(self.names))
+        )
 
     def _value(self, line: int, row: list[str], at: int) -> float:
         """Return the number of a row at a place, whose unit stays the same; NaN: an empty cell."""

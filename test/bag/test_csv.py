@@ -778,3 +778,29 @@ def test_the_words_of_a_title_are_no_names(tmp_path):
     body = "\n".join(line(k) for k in range(20))
     found = read_experiments(write(tmp_path / "a.csv", f"Step of today\n{body}"))
     assert found.notes[0] == "there is no header line; the columns are called '1', '2', '3'"
+
+
+@pytest.mark.parametrize(
+    "garbled", ["9.5,3.25,0.9.5,3.25,0.5", "3.25,0.5", "45.5,4.25,0.5,7", "7"]
+)
+def test_a_few_lines_with_another_number_of_cells_are_left_out(tmp_path, garbled):
+    rows = [line(k) for k in range(200)]
+    rows[100] = garbled
+    path = tmp_path / "a.csv"
+    found = read_experiments(write(path, "t,y,u\n" + "\n".join(rows)))
+    assert len(found.experiments[0]) == 199
+    cells = garbled.count(",") + 1
+    (note,) = (note for note in found.notes if "number of cells" in note)
+    assert note.startswith(
+        f"1 rows have another number of cells and are left out, the first: line 102: {cells} cells"
+    )
+    rows[50:60] = ["1,2,3,4"] * 10
+    with pytest.raises(BagError, match="line 52: 4 cells, but 3 columns have a name"):
+        read_experiments(write(path, "t,y,u\n" + "\n".join(rows)))
+
+
+def test_rows_without_their_last_empty_cells_are_whole(tmp_path):
+    rows = (f"{k},{k % 7}" + f",{k // 20 % 2}" * (k < 2 or k % 20 == 0) for k in range(200))
+    path = write(tmp_path / "a.csv", "t,y,u\n" + "\n".join(rows))
+    (record,) = read_experiments(path).experiments
+    assert len(record) == 200
