@@ -73,6 +73,9 @@ _COUNTED = (1.0, 1e-3, 1e-6)
 _HOUR, _UNSET = 3600 * 10**9, 0.02
 # Usual steps from the last time before a counter wraps around to the first one behind it.
 _FEW_STEPS = 3.0
+# Rows that were stamped on arrival: the step within a burst, as a share of the mean step; the
+# longest time between bursts [ns]; the deviation of their rate, and the least share within it.
+_NEAR, _LONGEST_WAIT, _UNSTEADY, _MOST = 0.25, 1e9, 0.3, 0.8
 # Smallest jump of a command that steps, as a share of its range, and largest share of rows with
 # a change.
 _JUMP, _MOVING = 0.05, 0.2
@@ -223,6 +226,15 @@ def _log(
             f"about {rows:g} rows share each time stamp, which is coarser than the sampling: they "
             "are spread evenly up to the next stamp"
         )
+    elif (arrivals := _arrivals(time_ns, values[0])) is not None:
+        # What arrives together was taken since the burst before.
+        late, rows = _spread(-arrivals[::-1])
+        time_ns = -late[::-1]
+        notes.append(
+            f"rows come in bursts of about {rows:g}, in which the measurement goes on as from one "
+            "to the next, so that they were stamped on arrival: they are spread evenly over the "
+            "time since the burst before"
+        )
     elif same:
         notes.append(
             f"{same} rows have the time of the row before; of such rows the last one's command "
@@ -239,6 +251,39 @@ def _log(
             )
         signals.append(Signal(name, time_ns[there], ordered[there]))
     return Log(signals[0], signals[1], dated, units, tuple(notes))
+
+
+def _arrivals(time_ns: IntArray, measurement: FloatArray) -> IntArray | None:
+    """Return for each row the last stamp of its burst; None: rows were not stamped on arrival.
+
+    Rows at a fixed rate that wait for their transport are many where the burst before is long ago,
+    and over a burst the measurement goes on as it does from the burst before to the one after. In
+    samples that were taken when they are stamped it would stand still, or move at one row.
+
+    :param time_ns: stamps in order, shape (n,).
+    :param measurement: the samples, shape (n,).
+    """
+    gaps = np.diff(time_ns)
+    near = gaps < _NEAR * np.mean(gaps)
+    last = np.append(np.flatnonzero(~near), gaps.size)
+    many = 2 * np.count_nonzero(near) > gaps.size and last.size >= _RESTART
+    if not many or bool(np.isnan(measurement).any()):
+        return None
+    counts, waits = np.diff(last, prepend=-1), np.diff(time_ns[last])
+    rates = waits / counts[1:]
+    moves = np.diff(measurement)
+    steady = np.mean(np.abs(rates / np.median(rates) - 1.0) <= _UNSTEADY)
+    once = 2.0 * np.mean(np.abs(moves[~near])) < np.mean(np.abs(moves[near]))
+    if np.median(waits) > _LONGEST_WAIT or steady < _MOST or once:
+        return None
+    # Of each burst: how far the measurement goes in it, and would go at the pace around it.
+    means = np.add.reduceat(measurement, last - counts + 1) / counts
+    went = (measurement[last] - measurement[last - counts + 1])[1:-1]
+    due = (means[2:] - means[:-2]) / 2.0 * (1.0 - 1.0 / counts[1:-1])
+    power = float(np.sum(due**2))
+    share = float(np.sum(went * due)) / power if power else 0.0
+    error = float(np.sqrt(np.mean((went - share * due) ** 2) / power)) if power else 0.0
+    return np.repeat(time_ns[last], counts) if 0.5 + 2.0 * error < share < 1.5 else None
 
 
 def _spread(time_ns: IntArray) -> tuple[IntArray, float]:

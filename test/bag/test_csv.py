@@ -804,3 +804,76 @@ def test_rows_without_their_last_empty_cells_are_whole(tmp_path):
     path = write(tmp_path / "a.csv", "t,y,u\n" + "\n".join(rows))
     (record,) = read_experiments(path).experiments
     assert len(record) == 200
+
+
+def bursts(taken, interval=0.05, spread=0.03):
+    """Return the times at which rows arrive that are taken at some times, and sent in bursts."""
+    calls = np.cumsum(interval + spread * (np.random.default_rng(3).random(taken.size) - 0.5))
+    sent = np.searchsorted(calls, taken)
+    return calls[sent] + 0.0002 * (np.arange(taken.size) - np.searchsorted(sent, sent))
+
+
+def response(t):
+    """Return a measurement and a command that steps each 2 s."""
+    since = np.mod(t, 4.0)
+    rise = 1.0 - np.exp(-since / 0.5)
+    fall = np.exp(-(since - 2.0) / 0.5)
+    y = 100.0 * np.where(since < 2.0, rise, fall)
+    return y + np.random.default_rng(4).normal(0.0, 1.0, t.size), (since < 2.0).astype(int)
+
+
+def table(path, t, y, u):
+    rows = zip(t, y, u, strict=True)
+    return write(path, "time,y,u\n" + "".join(f"{a:.6f},{b:.4f},{c}\n" for a, b, c in rows))
+
+
+def test_rows_that_were_stamped_in_bursts_are_spread_over_the_time_before(tmp_path):
+    taken = 0.01 * np.arange(1200)
+    t = bursts(taken)
+    assert np.all(np.diff(t) > 0.0)
+    found = read_experiments(table(tmp_path / "a.csv", t, *response(taken)))
+    (record,) = found.experiments
+    late = record.time - taken - np.median(record.time - taken)
+    assert np.max(np.abs(late)) < 0.04
+    assert np.std(late) < 0.5 * np.std(t - taken)
+    assert any("rows come in bursts of about 5" in note for note in found.notes)
+
+
+def sampled_at_once(taken):
+    t = bursts(taken)
+    return t, *response(t)
+
+
+def with_pauses(taken):
+    t = taken + 0.5 * (np.arange(taken.size) // 8)
+    return t, *response(t)
+
+
+def uneven(taken):
+    t = np.cumsum(np.random.default_rng(5).exponential(0.01, taken.size))
+    return t, *response(t)
+
+
+def on_change(taken):
+    t = np.arange(0.0, 24.0, 0.001)
+    y, u = response(t)
+    y = np.round(y - np.random.default_rng(4).normal(0.0, 1.0, t.size))
+    kept = np.flatnonzero(np.diff(y, prepend=-1.0))
+    return t[kept], y[kept], u[kept]
+
+
+def signal_by_signal(taken):
+    cycle, place = np.divmod(np.arange(taken.size), 5)
+    t = 0.05 * cycle + 0.0002 * place
+    y, u = response(0.05 * np.arange(cycle[-1] + 2))
+    return t, y[cycle + (place >= 2)], u[cycle]
+
+
+@pytest.mark.parametrize(
+    "way", [sampled_at_once, with_pauses, uneven, on_change, signal_by_signal]
+)
+def test_rows_that_were_taken_when_they_are_stamped_stay_there(tmp_path, way):
+    t, y, u = way(0.01 * np.arange(1200))
+    found = read_csv(table(tmp_path / "a.csv", t, y, u), Selection())
+    assert not any("bursts" in note for log in found for note in log.notes)
+    np.testing.assert_allclose(found[0].measurement.time_ns / 1e9, t, atol=1e-6)
