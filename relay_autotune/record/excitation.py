@@ -194,14 +194,10 @@ def answering_time(time: FloatArray, u: Input) -> float:
 def begins_at_rest(time: FloatArray, y: FloatArray, u: Input) -> bool:
     """Return whether an experiment begins with a rest, which shows what came before.
 
-    A command that is known to have held until the first sample is such a rest, too.
-
     :param time: of the samples [s], shape (n,).
     :param y: the measurement, shape (n,).
     :param u: the input.
     """
-    if isinstance(u, PiecewiseConstant) and u.times.size and u.times[0] == time[0]:
-        return True
     changes = changes_within(u, time)
     before = time < (changes[0] if changes.size else time[0])
     if np.count_nonzero(before) < _ENOUGH_REST or not np.ptp(time[before]) > 0.0:

@@ -66,7 +66,7 @@ from relay_autotune.record.excitation import (
     changes_within,
     longest_stay,
 )
-from relay_autotune.record.record import Input
+from relay_autotune.record.record import Input, PiecewiseConstant
 
 MOST_LAGS = 8
 _MOST_LAGS_WITH_ZERO = 4
@@ -600,7 +600,9 @@ def needs_no_past(problem: Problem, sign: int) -> bool:
         not sign
         and moves_seldom(problem)
         and all(
-            begins_at_rest(problem.time[part], problem.y[part], u)
+            # A command that is known to have held until the first sample is such a rest, too.
+            (isinstance(u, PiecewiseConstant) and u.times[0] == problem.time[part][0])
+            or begins_at_rest(problem.time[part], problem.y[part], u)
             for part, u in zip(problem.experiments, problem.inputs, strict=True)
         )
     )
