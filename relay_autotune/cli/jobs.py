@@ -402,7 +402,8 @@ def add_details(parser: argparse.ArgumentParser) -> None:
     add_times(taken)
     taken.add_argument(
         "--command-before", type=finite, metavar="U",
-        help="command that held before the recording, where that begins with its step",
+        help="command under which the process rested before the recording, where that begins "
+        "with its step",
     )  # fmt: skip
     taken.add_argument(
         "--clock", choices=CLOCKS, default=CLOCKS[0], metavar="TIME",

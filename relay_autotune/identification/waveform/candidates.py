@@ -254,8 +254,8 @@ class FitContext:
             "friction": not problem.friction or problem.dry_friction(found) >= least,
             "play": not problem.play or least <= problem.play_of(found) <= most,
         }
-        none = [term for term, may_be in possible.items() if not may_be]
-        return none + problem.terms_beyond(_FARTHEST, state.theta, found)
+        wrong = [term for term, may_be in possible.items() if not may_be]
+        return wrong + problem.terms_beyond(_FARTHEST, state.theta, found)
 
     def refit(self, problem: Problem, state: Trial) -> Candidate | None:
         """Fit a problem from the fit of a similar one; None as for :meth:`candidate`.
@@ -427,9 +427,9 @@ class FitContext:
                 if not structure.integrators:
                     problem = without(problem, ["friction"])
                 state = self._best_fit(problem, least)
-                if state is not None and (none := self._impossible(problem, state)):
+                if state is not None and (wrong := self._impossible(problem, state)):
                     # Another structure needed them.
-                    problem = without(problem, none)
+                    problem = without(problem, wrong)
                     state = self._best_fit(problem, least)
                 if state is not None:
                     least = min(least, max(state.cost, self.floor) / problem.time.size)
@@ -457,9 +457,9 @@ class FitContext:
         """
         problem = replace(candidate.problem, colour=colour)
         state = _refit(problem, candidate.state)
-        none = self._impossible(problem, state)
+        wrong = self._impossible(problem, state)
         return (
-            self.refit(without(problem, none), state) if none else self.candidate(problem, state)
+            self.refit(without(problem, wrong), state) if wrong else self.candidate(problem, state)
         )
 
     def _structures_of(self, name: str, order: int) -> Iterator[Structure]:
