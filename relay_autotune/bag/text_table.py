@@ -197,7 +197,7 @@ class TextTable:
         )
         above = [(line, _bare(cells, filled)) for line, cells in rows[:data]]
         if above and not self._is_header(above[-1][1], filled):
-            above[-1] = (above[-1][0], self._apart(above[-1][1], filled))
+            above[-1] = (above[-1][0], self._names_by_another_mark(above[-1][1], filled))
         fits = [self._is_header(cells, filled) for _, cells in above]
         if not fits or not fits[-1]:
             if not width:
@@ -256,7 +256,7 @@ class TextTable:
         fits = len(cells) == width if self._separator == " " else len(cells) >= max(width, 2)
         return fits and sum(map(bool, cells)) >= 2 and not _is_data(cells)
 
-    def _apart(self, cells: list[str], width: int) -> list[str]:
+    def _names_by_another_mark(self, cells: list[str], width: int) -> list[str]:
         """Return the cells of a line, or its names if another mark than in rows separates them.
 
         Spaces do not count, since they separate the words of a title, too.

@@ -55,12 +55,12 @@ _OF_SENSORS = re.compile(r"(deg ?|°)[CFK]|[kMm]?Pa|m?bar|psi|rpm")
 
 def words_of(name: str) -> frozenset[str]:
     """Return the words of a name without its unit, without digits and accents, in lower case."""
-    plain = unicodedata.normalize("NFKD", _apart(name).casefold())
+    plain = unicodedata.normalize("NFKD", _spaced(name).casefold())
     letters = "".join(c for c in plain if not unicodedata.combining(c))
     return frozenset(re.findall(r"[^\W\d_]+", letters))
 
 
-def _apart(name: str) -> str:
+def _spaced(name: str) -> str:
     """Return a name without its unit, and with a space before a capital within a word."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", without_unit(name))
 
@@ -91,7 +91,7 @@ def tag_of(name: str) -> str:
     >>> tag_of("yEst"), tag_of("uEst"), tag_of("T1"), tag_of("Q1")
     ('est', 'est', '1', '1')
     """
-    words = re.findall(r"[^\W\d_]+|\d+", _apart(name).casefold())
+    words = re.findall(r"[^\W\d_]+|\d+", _spaced(name).casefold())
     return " ".join(word for word in words if role_of(word) is None)
 
 

@@ -358,7 +358,7 @@ def _compared(
         # What came just before a step acts as a zero does, which no simple structure has.
         zeros = (_with_best_terms(context, [c]) for c in context.fit([SOPDT_ZERO.name]))
         decided = min((decided, *zeros), key=lambda c: _in_own_colour(context, c).score)
-    found = _best_with_terms(context, known, names, decided, simple)
+    found = _structures_with_terms(context, known, names, decided, simple)
     if not found or context.loads or len(context.problem.bounds) > 1:
         return found
     if found[0].problem.colour is None and not context.bounded:
@@ -398,7 +398,9 @@ def _with_a_load(
     ]
     if not better:
         return found
-    again = _best_with_terms(context, known, names, min(better, key=lambda c: c.score), loaded)
+    again = _structures_with_terms(
+        context, known, names, min(better, key=lambda c: c.score), loaded
+    )
     white = [c for c in _refit_all(None, again, context) if c.score < found[0].score]
     if not (white and _is_white(white[0]) and _is_clear_of_moves(white[0])):
         return found
@@ -422,7 +424,7 @@ def _is_white(candidate: Candidate) -> bool:
     return ljung_box(candidate.state.residual) >= _CHANCE
 
 
-def _best_with_terms(
+def _structures_with_terms(
     context: FitContext,
     known: Known,
     names: Sequence[str],

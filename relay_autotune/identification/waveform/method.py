@@ -304,15 +304,15 @@ def _has_a_level_of_its_own(
     """
     n, floor = away.size, away.size * NEGLIGIBLE**2
     runs = runs_of(away)
-    apart = float(np.sum(~away)) * _mean_square_left(rest, problem.part(~away))
+    apart = float(np.sum(~away)) * _mean_square_of(rest, problem.part(~away))
     apart += sum((stop - begin) * float(np.var(problem.y[begin:stop])) for begin, stop in runs)
     # Each level and its first and last instants are estimated; the last may be the record's.
     parameters = 3 * len(runs) - int(away[-1])
-    gained = information_criterion(n * _mean_square_left(whole, problem), n, 0, floor)
+    gained = information_criterion(n * _mean_square_of(whole, problem), n, 0, floor)
     return gained - information_criterion(apart, n, parameters, floor) > ANSWERED
 
 
-def _mean_square_left(fit: Fit, problem: Problem) -> float:
+def _mean_square_of(fit: Fit, problem: Problem) -> float:
     """Return the mean square that a model leaves of samples."""
     return mean_square_left(replace(fit, problem=with_terms_of(fit.problem, problem)))
 
