@@ -13,7 +13,7 @@ from scipy import signal
 from scipy.linalg import expm
 
 from relay_autotune.errors import RecordError
-from relay_autotune.identification.waveform.rational import columns_of
+from relay_autotune.identification.waveform.rational import Inputs, columns_of
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import (
     FOPDT,
@@ -159,9 +159,9 @@ def test_a_lag_under_a_busy_input_is_the_same_whatever_way_it_is_followed():
     time = np.linspace(0.0, 220.0, 500)
     for tau, dead_time in ((0.2, 0.4), (40.0, 1.3)):
         theta = np.array([np.log(tau), dead_time])
-        ((columns, derivatives),) = columns_of(FOPDT, theta, time, (u,))
+        ((columns, derivatives),) = columns_of(FOPDT, theta, time, Inputs((u,)))
         expected = response(TransferFunction.fopdt(1.0, tau, dead_time), time, u)
         np.testing.assert_allclose(columns[0], expected, atol=1e-10)
         step = 1e-6
-        ((slower, _),) = columns_of(FOPDT, theta + np.array([step, 0.0]), time, (u,))
+        ((slower, _),) = columns_of(FOPDT, theta + np.array([step, 0.0]), time, Inputs((u,)))
         np.testing.assert_allclose(derivatives[0, 0], (slower[0] - columns[0]) / step, atol=1e-4)

@@ -17,6 +17,7 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.candidates import support
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.rational import (
+    Inputs,
     columns_of,
     free_motion,
     responses,
@@ -64,13 +65,14 @@ DENOMINATORS = {
 def test_derivatives_are_the_limits_of_differences(name):
     denominator, powers, point = DENOMINATORS[name]
     theta = np.array(point)
-    ((_, derivatives),) = responses(denominator, powers, theta, TIME, (INPUT,))
+    ((_, derivatives),) = responses(denominator, powers, theta, TIME, Inputs((INPUT,)))
     _, free_derivatives = free_motion(denominator, theta, TIME)
     for i in range(theta.size):
         h = np.zeros(theta.size)
         h[i] = 1e-6
         up, down = (
-            responses(denominator, powers, theta + s * h, TIME, (INPUT,))[0][0] for s in (1, -1)
+            responses(denominator, powers, theta + s * h, TIME, Inputs((INPUT,)))[0][0]
+            for s in (1, -1)
         )
         error = np.abs((up - down) / 2e-6 - derivatives[i])
         # Samples beside a change, which crosses them as the dead time moves, are left out.
@@ -85,8 +87,8 @@ def test_derivatives_are_the_limits_of_differences(name):
 def test_without_slopes_the_responses_are_the_same(name):
     denominator, powers, point = DENOMINATORS[name]
     theta = np.array(point)
-    ((found, _),) = responses(denominator, powers, theta, TIME, (INPUT,))
-    ((alone, none),) = responses(denominator, powers, theta, TIME, (INPUT,), slopes=False)
+    ((found, _),) = responses(denominator, powers, theta, TIME, Inputs((INPUT,)))
+    ((alone, none),) = responses(denominator, powers, theta, TIME, Inputs((INPUT,)), slopes=False)
     np.testing.assert_allclose(alone, found, atol=1e-9 * np.abs(found).max())
     assert none.shape == (0, *found.shape)
     (found, _), (alone, none) = (free_motion(denominator, theta, TIME, slopes=s) for s in (1, 0))
@@ -112,7 +114,7 @@ def test_what_a_step_leaves_to_come_is_a_free_motion(name):
 def test_responses_are_those_of_the_transfer_function(name):
     denominator, powers, point = DENOMINATORS[name]
     theta = np.array(point)
-    ((found, _),) = responses(denominator, powers, theta, TIME, (INPUT,))
+    ((found, _),) = responses(denominator, powers, theta, TIME, Inputs((INPUT,)))
     constants = denominator.constants(theta[:-1])
     model = TransferFunction(1.0, (), constants, denominator.integrators, theta[-1])
     np.testing.assert_allclose(found[0], response(model, TIME, INPUT), atol=1e-9)
@@ -127,7 +129,7 @@ def test_responses_to_a_long_staircase_are_those_of_the_transfer_function(name):
     # Slow, and so fast that every change finds the last one settled.
     for faster in (0.0, 3.0):
         theta[: denominator.parameters] -= faster
-        ((found, _),) = responses(denominator, powers, theta, TIME, (u,))
+        ((found, _),) = responses(denominator, powers, theta, TIME, Inputs((u,)))
         constants = denominator.constants(theta[:-1])
         model = TransferFunction(1.0, (), constants, denominator.integrators, theta[-1])
         np.testing.assert_allclose(found[0], response(model, TIME, u), atol=1e-9)
@@ -135,8 +137,8 @@ def test_responses_to_a_long_staircase_are_those_of_the_transfer_function(name):
 
 def test_the_closed_form_of_a_lag_is_the_general_one():
     theta = np.array((1.6, 2.03))
-    (quick_one,) = columns_of(FOPDT, theta, TIME, (INPUT,))
-    (general_one,) = responses(FOPDT.denominator, FOPDT.powers, theta, TIME, (INPUT,))
+    (quick_one,) = columns_of(FOPDT, theta, TIME, Inputs((INPUT,)))
+    (general_one,) = responses(FOPDT.denominator, FOPDT.powers, theta, TIME, Inputs((INPUT,)))
     for quick, general in zip(quick_one, general_one, strict=True):
         np.testing.assert_allclose(quick, general, atol=1e-12)
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.identification.waveform.rational import columns_of, free_motion
+from relay_autotune.identification.waveform.rational import Inputs, columns_of, free_motion
 from relay_autotune.identification.waveform.residuals import Colour
 from relay_autotune.process.structures import Structure
 from relay_autotune.record.record import Input, PiecewiseConstant
@@ -341,7 +341,7 @@ class Problem:
         if self.friction:
             at_once = np.append(theta[:-1], 0.0)
             for columns, by_theta in columns_of(
-                structure, at_once, time, self.motions, slopes=slopes
+                structure, at_once, time, Inputs(self.motions), slopes=slopes
             ):
                 by_theta[-1:] = 0.0
                 blocks.append((columns, by_theta))
@@ -353,13 +353,15 @@ class Problem:
         return columns, np.concatenate([b[1] for b in blocks], axis=1), rest
 
     @cached_property
-    def delayed(self) -> list[tuple[Input, ...]]:
+    def delayed(self) -> list[Inputs]:
         """The inputs whose responses have the model's dead time, of each experiment.
 
         They are the command, then those of `_further` but friction.
         """
         each = zip(self.inputs, self.experiments, strict=True)
-        return [(_clipped(u, self.ends), *self._inputs_of_terms(u, part)) for u, part in each]
+        return [
+            Inputs((_clipped(u, self.ends), *self._inputs_of_terms(u, part))) for u, part in each
+        ]
 
     def _inputs_of_terms(self, u: Input, part: slice) -> Iterator[PiecewiseConstant]:
         if self.past:

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -25,11 +27,42 @@ _LOG_DAMPING = (math.log(0.005), math.log(50.0))
 _LOG_RANGE = 30.0
 
 
+# Its arrays have no equality of their own.
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """The inputs of one process, put together once for all trial parameters.
+
+    :param each: the deviation of each from its ``initial`` acts, of ramps as exactly as of steps;
+        only the first one may be of ramps.
+    """
+
+    each: tuple[Input, ...]
+
+    @cached_property
+    def alike(self) -> tuple[Inputs, ...]:
+        """The inputs of ramps, and those of steps."""
+        first, *others = self.each
+        if isinstance(first, PiecewiseConstant) or not others:
+            return (self,)
+        return Inputs((first,)), Inputs(tuple(others))
+
+    @cached_property
+    def steps(self) -> tuple[FloatArray, FloatArray]:
+        """When any of them steps, or its slope does [s], and by how much, (m,) and (inputs, m)."""
+        at = np.unique(np.concatenate([u.times for u in self.each]))
+        heights = np.zeros((len(self.each), at.size))
+        for row, u in zip(heights, self.each, strict=True):
+            # A ramp is a step that is integrated once more.
+            levels = u.levels if isinstance(u, PiecewiseConstant) else np.append(0.0, u.slopes)
+            row[at.searchsorted(u.times)] = np.diff(levels)
+        return at, heights
+
+
 def columns_of(
     structure: Structure,
     theta: FloatArray,
     time: FloatArray,
-    inputs: Sequence[Input],
+    inputs: Inputs,
     *,
     slopes: bool = True,
 ) -> list[tuple[FloatArray, FloatArray]]:
@@ -38,11 +71,11 @@ def columns_of(
     :param structure: the structure.
     :param theta: shape (m,).
     :param time: sample times [s], shape (n,).
-    :param inputs: the deviation of each from its ``initial`` acts.
+    :param inputs: what acts.
     :param slopes: False: without derivatives, shape (0, k, n).
     """
-    held = [u for u in inputs if isinstance(u, PiecewiseConstant)]
-    if structure == FOPDT and len(held) == len(inputs):
+    held = [u for u in inputs.each if isinstance(u, PiecewiseConstant)]
+    if structure == FOPDT and len(held) == len(inputs.each):
         every = (one_lag(theta, time, u) for u in held)
         return [(found, changes if slopes else changes[:0]) for found, changes in every]
     return responses(structure.denominator, structure.powers, theta, time, inputs, slopes=slopes)
@@ -150,7 +183,7 @@ def responses(
     powers: tuple[int, ...],
     theta: FloatArray,
     time: FloatArray,
-    inputs: Sequence[Input],
+    inputs: Inputs,
     *,
     slopes: bool = True,
 ) -> list[tuple[FloatArray, FloatArray]]:
@@ -163,25 +196,19 @@ def responses(
     :param powers: k of each response, p of them.
     :param theta: the parameters of the denominator, then D [s].
     :param time: sample times, not decreasing [s], shape (n,).
-    :param inputs: the deviation of each from its ``initial`` acts, of ramps as exactly as of
-        steps; only the first one may be of ramps.
+    :param inputs: what acts.
     :param slopes: False: without derivatives.
     :return: of each input shapes (p, n) and (len(theta), p, n), or (0, p, n).
     """
     own, dead_time = theta[:-1], float(theta[-1])
-    ramps = isinstance(inputs[0], PiecewiseLinear)
-    if ramps and len(inputs) > 1:
-        both = inputs[:1], inputs[1:]
-        alone, others = (
-            responses(denominator, powers, theta, time, some, slopes=slopes) for some in both
+    if len(inputs.alike) > 1:
+        every = (
+            responses(denominator, powers, theta, time, some, slopes=slopes)
+            for some in inputs.alike
         )
-        return alone + others
-    at = np.unique(np.concatenate([u.times for u in inputs]))
-    steps = np.zeros((len(inputs), at.size))
-    for row, u in zip(steps, inputs, strict=True):
-        # A ramp is a step that is integrated once more.
-        levels = u.levels if isinstance(u, PiecewiseConstant) else np.append(0.0, u.slopes)
-        row[at.searchsorted(u.times)] = np.diff(levels)
+        return [found for some in every for found in some]
+    ramps = isinstance(inputs.each[0], PiecewiseLinear)
+    at, steps = inputs.steps
     changes = at + dead_time
     unstable = any(f.unstable for f in denominator.factors)
     if unstable:
@@ -193,7 +220,7 @@ def responses(
     integrators = denominator.integrators + ramps
     values = _follow(constants, integrators, rows, time, changes, steps, backward=unstable)
     p, shape = len(powers), (-1, len(powers), time.size)
-    return [(values[:p, i], values[p:, i].reshape(shape)) for i in range(len(inputs))]
+    return [(values[:p, i], values[p:, i].reshape(shape)) for i in range(len(steps))]
 
 
 def free_motion(

@@ -23,7 +23,12 @@ from relay_autotune.identification.waveform.problem import (
     is_above,
     pulse,
 )
-from relay_autotune.identification.waveform.rational import columns_of, free_motion, unit_steps
+from relay_autotune.identification.waveform.rational import (
+    Inputs,
+    columns_of,
+    free_motion,
+    unit_steps,
+)
 from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Trial,
@@ -326,7 +331,7 @@ def _costs(
         # A dead time only shifts a response: one pass over shifted samples gives all rows.
         moved = time - dead_times[:, None]
         response, *shifted = (
-            shifted_columns(problem.structure, theta, moved, each)[0] for each in inputs
+            shifted_columns(problem.structure, theta, moved, each)[0] for each in inputs.each
         )
         if problem.relaxation:
             free, _ = free_motion(problem.structure.denominator, theta, time, slopes=False)
@@ -370,11 +375,11 @@ def likeliest_ends(problem: Problem) -> tuple[float, float] | None:
     ends = (-math.inf, *levels, math.inf)
     measured, answers = [], []
     parts = zip(few.experiments, few.inputs, few.delayed, few.lines, strict=True)
-    for part, u, (command, *_), line in parts:
+    for part, u, delayed, line in parts:
         time = few.time[part]
         moved = time - dead_times[:, None]
         of_levels = (of(u, level) for of in (distance, is_above) for level in levels)
-        inputs = (command, *of_levels)
+        inputs = (delayed.each[0], *of_levels)
         every = [
             shifted_columns(few.structure, np.array((math.log(tau), 0.0)), moved, each)[0]
             for tau in taus
@@ -418,7 +423,7 @@ def shifted_columns(
     :return: shape (k, rows, n).
     """
     order = np.argsort(moved, axis=None, kind="stable")
-    columns, _ = columns_of(structure, theta, moved.ravel()[order], (u,), slopes=False)[0]
+    columns, _ = columns_of(structure, theta, moved.ravel()[order], Inputs((u,)), slopes=False)[0]
     found = np.empty_like(columns)
     found[:, order] = columns
     return found.reshape(-1, *moved.shape)
