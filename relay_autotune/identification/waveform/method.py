@@ -36,7 +36,6 @@ from relay_autotune.identification.waveform.choice import (
     NoResponseError,
     ahead_of_command,
     chosen_fit,
-    mean_square_left,
     names_not_hopeless,
     odds_of_response,
 )
@@ -304,17 +303,25 @@ def _has_a_level_of_its_own(
     """
     n, floor = away.size, away.size * NEGLIGIBLE**2
     runs = runs_of(away)
-    apart = float(np.sum(~away)) * _mean_square_of(rest, problem.part(~away))
+    apart = float(np.sum(~away)) * _innovation_of(rest, problem.part(~away))
     apart += sum((stop - begin) * float(np.var(problem.y[begin:stop])) for begin, stop in runs)
     # Each level and its first and last instants are estimated; the last may be the record's.
-    parameters = 3 * len(runs) - int(away[-1])
-    gained = information_criterion(n * _mean_square_of(whole, problem), n, 0, floor)
-    return gained - information_criterion(apart, n, parameters, floor) > ANSWERED
+    parameters = 3 * len(runs) - int(away[-1]) + rest.state.parameters
+    together = information_criterion(
+        n * _innovation_of(whole, problem), n, whole.state.parameters, floor
+    )
+    return together - information_criterion(apart, n, parameters, floor) > ANSWERED
 
 
-def _mean_square_of(fit: Fit, problem: Problem) -> float:
-    """Return the mean square that a model leaves of samples."""
-    return mean_square_left(replace(fit, problem=with_terms_of(fit.problem, problem)))
+def _innovation_of(fit: Fit, problem: Problem) -> float:
+    """Return the mean square of what neither a model nor the colour of its noise tells of samples.
+
+    :param fit: perhaps of some of them.
+    :param problem: the samples.
+    """
+    some = with_terms_of(fit.problem, problem.thinned(fit.problem.time.size))
+    state = evaluate(replace(some, colour=fit.problem.colour), fit.state.theta)
+    return state.cost / state.residual.size
 
 
 def _without_dropouts(problem: Problem, chosen: Callable[[Problem], Fit]) -> tuple[Problem, str]:
