@@ -17,7 +17,7 @@ from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Outcome, PiecewiseConstant, Record
-from relay_autotune.verdict import Verdict
+from relay_autotune.verdict import Result, Verdict
 
 pytestmark = pytest.mark.long
 
@@ -101,6 +101,28 @@ def test_a_step_that_begins_with_the_record_keeps_its_direction(zero, before):
     assert found.verdict is Verdict.TRUSTED
     assert found.model.model.gain == pytest.approx(1.0, rel=0.02)
     assert found.model.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.1)
+
+
+def test_half_a_period_more_of_dead_time_is_no_other_direction():
+    """The first answers came late, for which a model of the wrong sign had been trusted."""
+    rng = np.random.default_rng(3)
+    time = 0.0234 * np.arange(630.0)
+    command = np.round(5.0 * np.sin(2.0 * np.pi * time), 2)
+    felt = np.where(time < 0.3, 0.0, command)
+    u = PiecewiseConstant.from_samples(time, felt)
+    y = response(TransferFunction.fopdt(1.15, 0.035, 0.0), time, u)
+    y += 5.3 * np.exp(-np.maximum(time - 0.3, 0.0) / 0.035)
+    y += 0.12 * rng.standard_normal(time.size)
+    whole, later = (
+        analyse(Record(time[at], y[at], command[at]), alone=True)
+        for at in (slice(None), slice(20, None))
+    )
+    # Of the first samples, the other direction explains more.
+    assert whole.model.model.process_sign == -1
+    results = {f.name: f.result for f in whole.judgement.findings}
+    assert results["direction"] is not Result.PASSED
+    assert later.model.model.gain == pytest.approx(1.15, rel=0.03)
+    assert later.model.opposed == 0.0
 
 
 def test_a_step_from_a_known_command_begins_from_rest():

@@ -60,6 +60,7 @@ UNTOLD = {
             "loaded",
             "to_explain",
             "parts",
+            "opposed",
             "plain",
         )
     ),

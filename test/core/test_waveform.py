@@ -18,6 +18,7 @@ from made_experiments import record_of
 from relay_runs import RelayRun, simulate_relay
 from sampled_relay import simulate_sampled_relay
 
+from relay_autotune.analysis import analyse
 from relay_autotune.errors import IdentificationError, ParameterError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.choice import NoResponseError, chosen_fit
@@ -36,6 +37,7 @@ from relay_autotune.process.structures import TABLE
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
+from relay_autotune.verdict import Verdict
 
 pytestmark = pytest.mark.long
 
@@ -480,6 +482,44 @@ def test_a_first_row_of_nothing_is_left_out():
     found = identify_waveform(Record(time, y, u(time), held_input=u))
     assert any("1 of the samples, the first at 0 s" in w for w in found.warnings)
     assert found.model.gain == pytest.approx(0.8, rel=0.06)
+
+
+def test_a_first_row_from_before_the_sensor_was_ready_is_left_out():
+    """A model that rings for ever had explained it beside a random walk."""
+    rng = np.random.default_rng(4)
+    time = 0.5 * np.arange(1440.0)
+    u = PiecewiseConstant(np.array([30.0]), np.array([30.0]), 0.0)
+    walk = np.cumsum(0.06 * rng.standard_normal(time.size))
+    y = 27.0 + response(TransferFunction.sopdt(5.0, (175.0, 170.0), 1.0), time, u) + walk
+    y = np.round(y / 0.25) * 0.25
+    y[0] = 3.75
+    found = identify_waveform(Record(time, y, u(time), held_input=u))
+    assert any("1 of the samples, the first at 0 s" in w for w in found.warnings)
+    assert found.model.gain == pytest.approx(5.0, rel=0.1)
+
+
+def test_a_process_that_falls_is_found_in_a_record_far_longer_than_its_fall():
+    """A record of 20 s had been searched for growth in 8 s and more."""
+    rng, period, late = np.random.default_rng(1), 0.002, 2
+    time = period * np.arange(10_000)
+    command, y = np.zeros(time.size), np.zeros(time.size)
+    angle = speed = rate = before = 0.0
+    for k in range(time.size):
+        y[k] = angle + 0.01 * rng.standard_normal()
+        rate += 0.2 * ((y[k] - before) / period - rate)
+        before = y[k]
+        frequency = (1.0, 1.4, 2.0)[3 * k // time.size]
+        command[k] = 6.0 * (2.0 * np.sin(2.0 * np.pi * frequency * time[k]) - y[k]) - 0.6 * rate
+        push = 58.0 * command[k - late] * (k >= late) + 30.0 * rng.standard_normal()
+        for _ in range(4):
+            angle += period / 4.0 * speed
+            speed += period / 4.0 * (100.0 * angle + push)
+    found = analyse(Record(time, y, command), alone=True)
+    assert found.verdict is Verdict.TRUSTED
+    assert found.model.structure == "unstable_sopdt"
+    model = found.model.model
+    assert np.sort(np.real(model.time_constants)) == pytest.approx([-0.1, 0.1], rel=0.05)
+    assert model.gain == pytest.approx(-0.58, rel=0.05)
 
 
 def test_where_a_coarse_sensor_drops_out_nothing_is_fitted():

@@ -124,7 +124,7 @@ def _beyond(evidence: Evidence) -> Measured | None:
     return Measured(1.0 / float(gain[0]), detail) if gain[0] > 0.0 else None
 
 
-def _direction(evidence: Evidence) -> Measured | None:
+def _direction(evidence: Evidence) -> Measured:
     found, relay = evidence.found, evidence.record.settings is not None
     sign = -found.model.process_sign
     raises, lowers = ("raises", "lowers") if sign > 0 else ("lowers", "raises")
@@ -148,7 +148,8 @@ def _direction(evidence: Evidence) -> Measured | None:
         for words, draws in models
         if draws
     ]
-    return Measured(*max(shares)) if shares else None
+    simulated = "a process of the other direction explains the record about as well"
+    return Measured(*max([*shares, (min(found.opposed, 1.0), simulated)]))
 
 
 def _left_out(evidence: Evidence) -> Measured:
@@ -166,7 +167,8 @@ MODEL_CHECKS = (
         name="direction",
         title="Direction",
         what="largest share of the models that the record, or a part of it, allows in which a "
-        "higher command moves the measurement the other way",
+        "higher command moves the measurement the other way; or the model's typical error over "
+        "that of such a one with less dead time",
         unit="",
         doubtful=0.5,
         failed=0.9,

@@ -53,6 +53,7 @@ from relay_autotune.process.structures import (
     FOPDT,
     INTEGRATOR_INVERSE,
     LAG_COMPLEX,
+    SOPDT,
     SOPDT_ZERO,
     TABLE,
     THREE_LAGS,
@@ -74,6 +75,8 @@ _SAMPLES_EACH = 8
 # Least number of moves of a command that tell whether one came before the record, and show a
 # response beside a slow disturbance.
 MANY = 6
+# Gains have to hold on the models of these, too.
+PLAIN = (FOPDT.name, SOPDT.name)
 # What may be estimated beside the model, as fields of a problem.
 TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "ends", "friction")
 # Those for which a dead time or a lag can stand.
@@ -85,6 +88,9 @@ _ASIDE = 0.1
 # Farthest that drift, free state or past may move by itself, in ranges of the measurement or of
 # the response: those that cancel one another explain anything.
 _FARTHEST = 10.0
+# Longest dead time with which a PI controller holds a process that grows, in time constants of its
+# growth. With a longer one, exp(-D s)/(1 - T s) is about the dead time D - T of any process.
+_HELD = 1.0
 # Gain in a score that changes no choice.
 LITTLE = 0.5
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
@@ -178,7 +184,7 @@ class FitContext:
 
     @cached_property
     def unstable(self) -> Trial:
-        """The best fit of an unstable FOPDT, from which a further lag goes on."""
+        """The best fit of an unstable FOPDT."""
         problem = replace(self.problem, structure=UNSTABLE_FOPDT)
         return best_of(problem, start_unstable(problem))
 
@@ -228,7 +234,7 @@ class FitContext:
         elif model.dead_time > (latest := self.latest[model.process_sign > 0]):
             # The measurement had moved by then, whatever else a fit would explain so.
             return self.refit(replace(problem, latest=latest), state)
-        if model.growth_in(1.0) > self.most_growth:
+        if model.growth_in(1.0) > self.most_growth or model.growth_in(model.dead_time) > _HELD:
             return None
         if self._impossible(problem, state):
             return None
@@ -351,12 +357,8 @@ class FitContext:
         own, plain = (information_criterion(s.cost, n, 0, self.floor) for s in (state, fopdt))
         if own - plain <= LITTLE:
             return state
-        starts = self._starts(Guess.of(beside, fopdt), problem.structure)
+        starts = _starts(problem, Guess.of(beside, fopdt))
         return min(state, best_of(problem, starts), key=lambda s: s.cost)
-
-    def _starts(self, guess: Guess, structure: Structure) -> list[FloatArray]:
-        growing = math.exp(float(self.unstable.theta[0])) if structure.unstable else math.nan
-        return guess.starts(structure, growing)
 
     def _fopdt_of(self, problem: Problem) -> Trial:
         """Return the best fit of a FOPDT with some terms, found once for the same samples.
@@ -449,6 +451,16 @@ class FitContext:
             found.append(None if state is None else self.candidate(problem, state))
         return [c for c in found if c is not None and c.model.process_sign * self.sign < 0]
 
+    def best_of_direction(self, sign: int) -> list[Candidate]:
+        """Return plain models of one direction, from starts of their own.
+
+        :param sign: of the gain, 1 or -1.
+        """
+        problem = replace(without(self.problem, ["friction"]), structure=FOPDT, colour=None)
+        fopdt = best_of(problem, start_fopdt(problem, sign))
+        found = replace(self, problem=problem, fopdt=fopdt, _fits={}).fit(PLAIN)
+        return [c for c in found if c.model.process_sign == sign]
+
     def refit_in_colour(self, candidate: Candidate, colour: Colour | None) -> Candidate | None:
         """Fit a candidate in another colour, without terms that come out impossible there.
 
@@ -483,7 +495,7 @@ class FitContext:
             return self.fopdt
         if known and problem.structure == UNSTABLE_FOPDT:
             return self.unstable
-        state = multistart(problem, self._starts(self.guess, problem.structure), least)
+        state = multistart(problem, _starts(problem, self.guess), least)
         if problem.structure.zero is not None:
             return self._with_zero_on_either_side(problem, state, least)
         if state is not None:
@@ -513,6 +525,12 @@ class FitContext:
         nearer = min((evaluate(problem, theta) for theta in starts), key=lambda s: s.cost)
         again = refine(problem, nearer, tolerance=TRIAL)
         return again if state is None else min(state, again, key=lambda s: s.cost)
+
+
+def _starts(problem: Problem, guess: Guess) -> list[FloatArray]:
+    """Return where the fits of a structure begin; one that grows is not like any FOPDT."""
+    structure = problem.structure
+    return start_unstable(problem) if structure.unstable else guess.starts(structure)
 
 
 def _key_of_fit(problem: Problem) -> tuple[object, ...]:

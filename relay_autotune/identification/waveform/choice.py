@@ -25,6 +25,7 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.candidates import (
     LITTLE,
+    PLAIN,
     Candidate,
     FitContext,
     drop_first_dead_time,
@@ -46,6 +47,7 @@ from relay_autotune.identification.waveform.separable import (
     Trial,
     information_criterion,
     refine,
+    residual_of_model,
     rms_in_simulation,
 )
 from relay_autotune.identification.waveform.starts import large_changes
@@ -79,8 +81,6 @@ TRIED = tuple(
 # By these it is decided what is estimated beside the model: a command off the balance of an
 # integrator looks like a drift.
 SIMPLE = (FOPDT.name, SOPDT.name, IPDT.name)
-# Gains have to hold on the models of these, too.
-PLAIN = (FOPDT.name, SOPDT.name)
 # Numbers of samples, and samples for each response of the process. More correlated samples tell
 # little, unless the process is fast; much denser ones would favour what is faster than it.
 _FEW, _MOST = 2000, 4000
@@ -191,10 +191,31 @@ def chosen_fit(
     # are left out next.
     *first, last = fits
     best = next((f for f in first if odds_of_response(f.problem, f.state) > ANSWERED), last)
+    if not sign:
+        best = replace(best, opposed=partial(_opposed, few, best))
     plain = next((c for c in own if c.structure == FOPDT), None)
     if plain is None or best.problem.structure == FOPDT:
         return best
     return replace(best, plain=partial(_fitted_to_all, plain, [], problem, scale))
+
+
+def _opposed(context: FitContext, fit: Fit) -> float:
+    """Return the typical error of a fit over that of the other direction's best model.
+
+    To a command that is nearly periodic, a process and its reverse half a period later answer
+    alike. A short stretch, in which something else moved the measurement, may decide for the
+    later one, though so long a dead time is rare: so the medians of the errors are compared.
+
+    :param context: the samples.
+    :param fit: has the terms beside the model.
+    :return: 0 where no plain model of the other direction has less dead time.
+    """
+    model = fit.problem.structure.model_at(fit.state.theta, fit.state.coefficients)
+    assert model is not None
+    problem = with_terms_of(fit.problem, context.problem)
+    others = replace(context, problem=problem).best_of_direction(-model.process_sign)
+    earlier = [c for c in others if c.model.dead_time < model.dead_time]
+    return _typical_error(fit) / min(map(_typical_error, earlier), default=math.inf)
 
 
 def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candidate]:
@@ -566,6 +587,16 @@ def _simulates(candidate: Candidate, least: float) -> bool:
     :param least: mean square that the best simulation leaves.
     """
     return mean_square_left(candidate) <= _WORSE * least
+
+
+def _typical_error(found: Candidate | Fit) -> float:
+    """Return the median magnitude of what a candidate or a fit leaves in simulation.
+
+    :param found: with what was fitted.
+    """
+    problem, state = replace(found.problem, colour=None), found.state
+    gain = state.coefficients[: len(problem.structure.powers)]
+    return float(np.median(np.abs(residual_of_model(problem, gain, state.theta))))
 
 
 def mean_square_left(found: Candidate | Fit) -> float:

@@ -115,6 +115,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         ultimate_frequency_std=frequency_std,
         draws=allowed.models,
         parts=allowed.parts,
+        opposed=fit.opposed() if fit.opposed else 0.0,
         effects=problem.effects(state.coefficients),
         middle=middle_of(problem.inputs[0]) if problem.unequal else math.nan,
         ends=problem.ends_of(state.coefficients),

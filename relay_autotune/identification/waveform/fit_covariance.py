@@ -42,6 +42,8 @@ class Fit:
     :param loss: the loss that was minimised.
     :param warnings: sentences on what was left out.
     :param plain: fits the FOPDT beside the same terms to the end; None: there is none.
+    :param opposed: returns its typical error over that of a model of the other direction with
+        less dead time; None: the direction is known.
     """
 
     problem: Problem
@@ -52,6 +54,7 @@ class Fit:
     loss: str = "squares"
     warnings: tuple[str, ...] = ()
     plain: Callable[[], Fit | None] | None = None
+    opposed: Callable[[], float] | None = None
 
 
 def raw_residual(problem: Problem, state: Trial) -> FloatArray:

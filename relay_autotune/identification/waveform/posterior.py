@@ -23,7 +23,7 @@ from scipy.special import gammaincinv
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.result import Part
-from relay_autotune.identification.waveform.choice import PLAIN
+from relay_autotune.identification.waveform.candidates import PLAIN
 from relay_autotune.identification.waveform.fit_covariance import Fit
 from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem
 from relay_autotune.identification.waveform.rational import unit_steps

@@ -32,7 +32,6 @@ from relay_autotune.identification.waveform.rational import (
 from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Trial,
-    evaluate,
     information_criterion,
     predicted_cost,
     refine,
@@ -164,6 +163,8 @@ _SHARES = (
     *(0.0, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.67, 0.8, 0.95),
     *(1.2, 1.5, 1.9, 2.4),
 )
+# Second lags of a process that grows by itself, relative to the time constant of its growth.
+_RATIOS = (0.1, 0.3, 1.0, 3.0)
 
 
 def is_controlled(time: FloatArray, u: Input) -> bool:
@@ -290,15 +291,47 @@ def start_fopdt(problem: Problem, sign: int = 0) -> list[FloatArray]:
     :param sign: of the gain, 1 or -1; 0: not known.
     """
     shortest, longest = time_scales(problem)
+    logs = np.log(_lags(shortest, longest, 14))[:, None]
+    dead_times = np.tile(longest * np.array(_SHARES), (logs.size, 1))
+    return _best_of_grid(problem, logs, dead_times, latest_dead_times(problem, sign))
+
+
+def start_unstable(problem: Problem) -> list[FloatArray]:
+    """Return the best few of a grid of lags and D for a process that grows by itself.
+
+    A controller may hold one that is many times faster than the record is long. No PI holds one
+    whose dead time is longer than the time constant of its growth.
+
+    :param problem: with an unstable structure of one lag, or of two.
+    """
+    shortest, longest = time_scales(problem)
+    growing = np.log(_lags(shortest, longest, 14))[:, None]
+    logs = growing
+    if problem.structure.order > 1:
+        pairs = itertools.product(growing[:, 0], np.log(_RATIOS))
+        logs = np.array([(one, one + ratio) for one, ratio in pairs])
+    dead_times = np.exp(logs[:, :1]) * np.array(_SHARES[:14:2])
+    return _best_of_grid(problem, logs, dead_times, (math.inf, math.inf))
+
+
+def _best_of_grid(
+    problem: Problem, logs: FloatArray, dead_times: FloatArray, latest: tuple[float, float]
+) -> list[FloatArray]:
+    """Return the best few of some theta, on few samples.
+
+    :param problem: any structure without a zero.
+    :param logs: parameters of the factors, shape (g, m - 1).
+    :param dead_times: of each [s], shape (g, d).
+    :param latest: as of :func:`latest_dead_times`.
+    """
     few = problem.thinned(_GRID_SAMPLES, scattered=True)
-    taus = _lags(shortest, longest, 14)
-    dead_times = longest * np.array(_SHARES)
-    latest = latest_dead_times(problem, sign)
-    costs = np.array([_costs(few, tau, dead_times, latest) for tau in taus])
+    rows = zip(logs, dead_times, strict=True)
+    costs = np.array([_costs(few, own, each, latest) for own, each in rows])
+    _, longest = time_scales(problem)
     best: list[FloatArray] = []
     for flat in np.argsort(costs, axis=None, kind="stable"):
         i, j = np.unravel_index(flat, costs.shape)
-        theta = np.array((math.log(taus[i]), dead_times[j] + 1e-3 * longest))
+        theta = np.append(logs[i], dead_times[i, j] + 1e-3 * longest)
         if all(_apart(theta, other) for other in best):
             best.append(theta)
         if len(best) == _BEST:
@@ -312,18 +345,18 @@ def _lags(shortest: float, longest: float, count: int) -> FloatArray:
 
 
 def _apart(a: FloatArray, b: FloatArray) -> bool:
-    return abs(a[0] - b[0]) > 0.5 or abs(math.log(a[1] / b[1])) > 0.5
+    return bool(np.abs(a - b)[:-1].max() > 0.5) or abs(math.log(a[-1] / b[-1])) > 0.5
 
 
 def _costs(
-    problem: Problem, tau: float, dead_times: FloatArray, latest: tuple[float, float]
+    problem: Problem, logs: FloatArray, dead_times: FloatArray, latest: tuple[float, float]
 ) -> FloatArray:
-    """Return the sums of squares that a lag and the terms beside it leave, for each dead time.
+    """Return the sums of squares that lags and the terms beside them leave, for each dead time.
 
     Half a period later, a limit cycle of the other sign looks much the same: a lag of the wrong
     sign counts as no explanation, as does one that begins after the first response.
     """
-    theta = np.array((math.log(tau), 0.0))
+    theta, unstable = np.append(logs, 0.0), problem.structure.unstable
     along, power, total = (np.zeros(dead_times.size) for _ in range(3))
     every = zip(problem.experiments, problem.delayed, problem.lines, strict=True)
     for part, inputs, fixed in every:
@@ -333,8 +366,14 @@ def _costs(
         response, *shifted = (
             shifted_columns(problem.structure, theta, moved, each)[0] for each in inputs.each
         )
-        if problem.relaxation:
-            free, _ = free_motion(problem.structure.denominator, theta, time, slopes=False)
+        if problem.relaxation or unstable:
+            free, _ = free_motion(
+                problem.structure.denominator,
+                theta,
+                time,
+                growing_only=not problem.relaxation,
+                slopes=False,
+            )
             fixed = np.concatenate((fixed, free))
         rows = np.stack(
             [np.broadcast_to(row, moved.shape) for row in (y, response, *fixed, *shifted)]
@@ -467,20 +506,19 @@ class Guess:
         phase = w * self.dead_time + math.atan(w * self.tau) - order * math.atan(w * tau)
         return tau, max(phase / w, self.shortest)
 
-    def starts(self, structure: Structure, growing: float) -> list[FloatArray]:
+    def starts(self, structure: Structure) -> list[FloatArray]:
         """Return starts of a structure: all its lags alike, or one slow and the others fast.
 
-        The slow one is the FOPDT's, an integrator or what grows; the fast ones take their share
-        of its dead time, or are longer. A zero can look like a dead time, or hide it.
+        The slow one is the FOPDT's, or an integrator; the fast ones take their share of its dead
+        time, or are longer. A zero can look like a dead time, or hide it.
 
-        :param structure: any.
-        :param growing: time constant of what grows [s].
+        :param structure: any that does not grow by itself.
         """
         factors = structure.factors
         if not factors:
             return [np.array([self.dead_time])]
         found = []
-        stable = not (structure.integrators or structure.unstable)
+        stable = not structure.integrators
         one_kind = len(factors) == 1 and not isinstance(factors[0], Quadratic)
         if stable:
             tau, dead_time = self.equal_lags(structure.order)
@@ -493,7 +531,7 @@ class Guess:
                     fast = max(share * self.dead_time, self.shortest)
                     logs: list[float] = []
                     for i, factor in enumerate(factors):
-                        large = growing if factor.unstable else self.tau if i == slow else fast
+                        large = self.tau if i == slow else fast
                         pair = isinstance(factor, Quadratic)
                         logs += _two_lags(large, fast) if pair else [math.log(large)]
                     found.append(np.array([*logs, max(1.0 - share, 0.2) * self.dead_time]))
@@ -516,18 +554,3 @@ def _two_lags(large: float, small: float) -> list[float]:
     """Return log(1/w0) and log zeta of two lags, at least a little apart."""
     pair = math.sqrt(large * small)
     return [math.log(pair), math.log(max((large + small) / (2.0 * pair), 1.05))]
-
-
-def start_unstable(problem: Problem) -> list[FloatArray]:
-    """Return the best few of a grid of (log tau, D) for an unstable FOPDT.
-
-    :param problem: with an unstable FOPDT structure.
-    """
-    few, (_, longest) = coarse(problem), time_scales(problem)
-    grid = [
-        np.array((math.log(tau * longest), share * longest))
-        for tau in (0.4, 1.0, 2.5, 6.0, 20.0)
-        for share in (0.05, 0.2, 0.4, 0.7)
-    ]
-    states = [evaluate(few, theta) for theta in grid]
-    return [s.theta for s in sorted(states, key=lambda s: s.cost)[:2]]
