@@ -166,9 +166,8 @@ MODEL_CHECKS = (
     Check(
         name="direction",
         title="Direction",
-        what="largest share of the models that the record, or a part of it, allows in which a "
-        "higher command moves the measurement the other way; or the model's typical error over "
-        "that of such a one with less dead time",
+        what="largest share of models of the other direction that the record, or a part of it, "
+        "allows; or the model's typical error over that of one of them with less dead time",
         unit="",
         doubtful=0.5,
         failed=0.9,
