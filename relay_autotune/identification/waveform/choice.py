@@ -45,9 +45,9 @@ from relay_autotune.identification.waveform.residuals import (
 from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Trial,
+    errors_in_simulation,
     information_criterion,
     refine,
-    residual_of_model,
     rms_in_simulation,
 )
 from relay_autotune.identification.waveform.starts import large_changes
@@ -200,7 +200,7 @@ def chosen_fit(
 
 
 def _opposed(context: FitContext, fit: Fit) -> float:
-    """Return the typical error of a fit over that of the other direction's best model.
+    """Return how well the best model of the other direction explains a record, beside a fit.
 
     To a command that is nearly periodic, a process and its reverse half a period later answer
     alike. A short stretch, in which something else moved the measurement, may decide for the
@@ -208,14 +208,29 @@ def _opposed(context: FitContext, fit: Fit) -> float:
 
     :param context: the samples.
     :param fit: has the terms beside the model.
-    :return: 0 where no plain model of the other direction has less dead time.
+    :return: the smaller of two ratios, of the fit's error over the other's and of what the other
+        explains over what the fit does; 0 where no plain one has less dead time.
     """
     model = fit.problem.structure.model_at(fit.state.theta, fit.state.coefficients)
     assert model is not None
     problem = with_terms_of(fit.problem, context.problem)
     others = replace(context, problem=problem).best_of_direction(-model.process_sign)
-    earlier = [c for c in others if c.model.dead_time < model.dead_time]
-    return _typical_error(fit) / min(map(_typical_error, earlier), default=math.inf)
+    own, total = _typical_squares(fit)
+    least = min(
+        (_typical_squares(c)[0] for c in others if c.model.dead_time < model.dead_time),
+        default=math.inf,
+    )
+    return min(math.sqrt(own / least), max(total - least, 0.0) / max(total - own, NEGLIGIBLE**2))
+
+
+def _typical_squares(found: Candidate | Fit) -> tuple[float, float]:
+    """Return the median squares of what a model leaves in simulation, and is to explain.
+
+    :param found: with what was fitted.
+    """
+    parts = errors_in_simulation(found.problem, found.state.coefficients, found.state.theta)
+    left, total = (float(np.median(np.square(part))) for part in parts)
+    return left, total
 
 
 def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candidate]:
@@ -587,16 +602,6 @@ def _simulates(candidate: Candidate, least: float) -> bool:
     :param least: mean square that the best simulation leaves.
     """
     return mean_square_left(candidate) <= _WORSE * least
-
-
-def _typical_error(found: Candidate | Fit) -> float:
-    """Return the median magnitude of what a candidate or a fit leaves in simulation.
-
-    :param found: with what was fitted.
-    """
-    problem, state = replace(found.problem, colour=None), found.state
-    gain = state.coefficients[: len(problem.structure.powers)]
-    return float(np.median(np.abs(residual_of_model(problem, gain, state.theta))))
 
 
 def mean_square_left(found: Candidate | Fit) -> float:

@@ -110,7 +110,15 @@ def residual_of_model(problem: Problem, gain: FloatArray, theta: FloatArray) -> 
 def rms_in_simulation(
     problem: Problem, coefficients: FloatArray, theta: FloatArray
 ) -> tuple[float, float]:
-    """Return the rms that a model leaves in simulation, and that of what it is to explain.
+    """Return the rms of both results of :func:`errors_in_simulation`."""
+    left, total = errors_in_simulation(problem, coefficients, theta)
+    return math.sqrt(float(np.mean(left**2))), math.sqrt(float(np.mean(total**2)))
+
+
+def errors_in_simulation(
+    problem: Problem, coefficients: FloatArray, theta: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return what a model leaves in simulation, and what it is to explain, shapes (n,).
 
     All beside the model is fitted anew; the model keeps its own coefficients.
 
@@ -120,8 +128,7 @@ def rms_in_simulation(
     """
     problem = replace(problem, colour=None)
     left = residual_of_model(problem, coefficients[: len(problem.structure.powers)], theta)
-    total = residual_of(problem.y_seen, problem.nuisances(theta))
-    return math.sqrt(float(np.mean(left**2))), math.sqrt(float(np.mean(total**2)))
+    return left, residual_of(problem.y_seen, problem.nuisances(theta))
 
 
 def _back_substituted(r: list[list[float]], right: list[float]) -> FloatArray:
