@@ -353,7 +353,7 @@ def _nanoseconds(
             f"{path}: the column {name!r} steps by {step:g} from row to row and names no unit; "
             f"expected seconds, or --time-unit {'|'.join(TIME_UNITS)}"
         )
-    elif scale is None and step >= 5.0 and not np.any(time % 1.0):
+    elif scale is None and step >= 2.0 and not np.any(time % 1.0):
         notes.append(
             f"the time is taken in seconds, {step:g} s from row to row; --time-unit names another"
         )
@@ -601,10 +601,11 @@ def _steps(values: FloatArray) -> bool:
 
 
 def _named(path: Path, names: Sequence[str], wanted: str) -> int:
-    """Return the place of a column, whose name may be without its unit."""
-    fits = [k for k, name in enumerate(names) if name == wanted] or [
-        k for k, name in enumerate(names) if without_unit(name) == wanted
-    ]
+    """Return the place of a column by its name, perhaps without the unit, or by its number."""
+    numbers = [str(k + 1) for k in range(len(names))]
+    ways = (names, map(without_unit, names), numbers)
+    every = ([k for k, name in enumerate(way) if name == wanted] for way in ways)
+    fits = next(filter(None, every), [])
     if len(fits) > 1:
         raise SelectionError(
             f"{path} has {len(fits)} columns named {wanted!r}; expected a name of its own for "

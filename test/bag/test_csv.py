@@ -577,6 +577,17 @@ def test_two_columns_of_one_name_have_to_be_renamed(tmp_path):
         read_experiments(write(tmp_path / "a.csv", text))
 
 
+def test_a_column_whose_name_cannot_be_typed_is_chosen_by_its_number(tmp_path):
+    rows = [f"{2 * k},{k % 7 + 0.25},{k // 5 % 2}.5" for k in range(20)]
+    path = write(tmp_path / "a.csv", "time,speed\\n,duty\\n\n" + "\n".join(rows))
+    found = read_experiments(path, Selection("2", "3"))
+    (record,) = found.experiments
+    assert record.measurement.tolist() == [float(row.split(",")[1]) for row in rows]
+    assert any("in seconds, 2 s from row to row; --time-unit names" in n for n in found.notes)
+    with pytest.raises(SelectionError, match="no column '4'"):
+        read_experiments(path, Selection("4", "3"))
+
+
 def test_rows_without_times_need_their_period(tmp_path):
     cells = [line(k).split(",") for k in range(20)]
     text = "input,output\n" + "\n".join(f"{u},{y}" for _, y, u in cells)
