@@ -167,7 +167,7 @@ MODEL_CHECKS = (
         name="direction",
         title="Direction",
         what="largest share of models of the other direction that the record, or a part of it, "
-        "allows; or how well one of them with less dead time explains as much",
+        "allows; or how well one of them that answers within the dead time explains as much",
         unit="",
         doubtful=0.5,
         failed=0.9,

@@ -155,6 +155,7 @@ class FitContext:
     held: bool
     loads: bool
     _fits: dict[tuple[object, ...], Trial] = field(default_factory=dict, repr=False)
+    _growing: dict[str, list[FloatArray]] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, problem: Problem, sign: int, *, held: bool) -> FitContext:
@@ -186,7 +187,7 @@ class FitContext:
     def unstable(self) -> Trial:
         """The best fit of an unstable FOPDT."""
         problem = replace(self.problem, structure=UNSTABLE_FOPDT)
-        return best_of(problem, start_unstable(problem))
+        return best_of(problem, self._starts(problem, self.guess))
 
     @cached_property
     def latest(self) -> tuple[float, float]:
@@ -357,8 +358,20 @@ class FitContext:
         own, plain = (information_criterion(s.cost, n, 0, self.floor) for s in (state, fopdt))
         if own - plain <= LITTLE:
             return state
-        starts = _starts(problem, Guess.of(beside, fopdt))
+        starts = self._starts(problem, Guess.of(beside, fopdt))
         return min(state, best_of(problem, starts), key=lambda s: s.cost)
+
+    def _starts(self, problem: Problem, guess: Guess) -> list[FloatArray]:
+        """Return where the fits of a structure begin; one that grows is not like any FOPDT.
+
+        A grid tells them once, since the terms beside the model change them little.
+        """
+        structure = problem.structure
+        if not structure.unstable:
+            return guess.starts(structure)
+        if structure.name not in self._growing:
+            self._growing[structure.name] = start_unstable(problem)
+        return self._growing[structure.name]
 
     def _fopdt_of(self, problem: Problem) -> Trial:
         """Return the best fit of a FOPDT with some terms, found once for the same samples.
@@ -495,7 +508,7 @@ class FitContext:
             return self.fopdt
         if known and problem.structure == UNSTABLE_FOPDT:
             return self.unstable
-        state = multistart(problem, _starts(problem, self.guess), least)
+        state = multistart(problem, self._starts(problem, self.guess), least)
         if problem.structure.zero is not None:
             return self._with_zero_on_either_side(problem, state, least)
         if state is not None:
@@ -525,12 +538,6 @@ class FitContext:
         nearer = min((evaluate(problem, theta) for theta in starts), key=lambda s: s.cost)
         again = refine(problem, nearer, tolerance=TRIAL)
         return again if state is None else min(state, again, key=lambda s: s.cost)
-
-
-def _starts(problem: Problem, guess: Guess) -> list[FloatArray]:
-    """Return where the fits of a structure begin; one that grows is not like any FOPDT."""
-    structure = problem.structure
-    return start_unstable(problem) if structure.unstable else guess.starts(structure)
 
 
 def _key_of_fit(problem: Problem) -> tuple[object, ...]:

@@ -209,7 +209,7 @@ def _opposed(context: FitContext, fit: Fit) -> float:
     :param context: the samples.
     :param fit: has the terms beside the model.
     :return: the smaller of two ratios, of the fit's error over the other's and of what the other
-        explains over what the fit does; 0 where no plain one has less dead time.
+        explains over what the fit does; 0 where no plain one answers within the fit's dead time.
     """
     model = fit.problem.structure.model_at(fit.state.theta, fit.state.coefficients)
     assert model is not None
@@ -217,10 +217,12 @@ def _opposed(context: FitContext, fit: Fit) -> float:
     others = replace(context, problem=problem).best_of_direction(-model.process_sign)
     own, total = _typical_squares(fit)
     least = min(
-        (_typical_squares(c)[0] for c in others if c.model.dead_time < model.dead_time),
+        (_typical_squares(c)[0] for c in others if c.model.response_time < model.dead_time),
         default=math.inf,
     )
-    return min(math.sqrt(own / least), max(total - least, 0.0) / max(total - own, NEGLIGIBLE**2))
+    floor = NEGLIGIBLE**2
+    explained = max(total - least, 0.0) / max(total - own, floor)
+    return min(math.sqrt(own / max(least, floor)), explained)
 
 
 def _typical_squares(found: Candidate | Fit) -> tuple[float, float]:

@@ -319,7 +319,9 @@ def _innovation_of(fit: Fit, problem: Problem) -> float:
     :param fit: perhaps of some of them.
     :param problem: the samples.
     """
-    some = with_terms_of(fit.problem, problem.thinned(fit.problem.time.size))
+    # A colour is of samples at one distance.
+    every = slice(None, None, int(np.median(np.diff(fit.problem.index))))
+    some = with_terms_of(fit.problem, problem.part(every))
     state = evaluate(replace(some, colour=fit.problem.colour), fit.state.theta)
     return state.cost / state.residual.size
 

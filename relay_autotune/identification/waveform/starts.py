@@ -163,6 +163,8 @@ _SHARES = (
     *(0.0, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.27, 0.35, 0.45, 0.55, 0.67, 0.8, 0.95),
     *(1.2, 1.5, 1.9, 2.4),
 )
+# What starts have more than a dead time of the grid, as a share of its least step.
+_OFF_GRID = 0.1
 # Second lags of a process that grows by itself, relative to the time constant of its growth.
 _RATIOS = (0.1, 0.3, 1.0, 3.0)
 
@@ -321,17 +323,16 @@ def _best_of_grid(
 
     :param problem: any structure without a zero.
     :param logs: parameters of the factors, shape (g, m - 1).
-    :param dead_times: of each [s], shape (g, d).
+    :param dead_times: of each, ascending from 0 [s], shape (g, d).
     :param latest: as of :func:`latest_dead_times`.
     """
     few = problem.thinned(_GRID_SAMPLES, scattered=True)
     rows = zip(logs, dead_times, strict=True)
     costs = np.array([_costs(few, own, each, latest) for own, each in rows])
-    _, longest = time_scales(problem)
     best: list[FloatArray] = []
     for flat in np.argsort(costs, axis=None, kind="stable"):
         i, j = np.unravel_index(flat, costs.shape)
-        theta = np.append(logs[i], dead_times[i, j] + 1e-3 * longest)
+        theta = np.append(logs[i], dead_times[i, j] + _OFF_GRID * dead_times[i, 1])
         if all(_apart(theta, other) for other in best):
             best.append(theta)
         if len(best) == _BEST:
