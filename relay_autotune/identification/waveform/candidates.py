@@ -88,9 +88,10 @@ _ASIDE = 0.1
 # Farthest that drift, free state or past may move by itself, in ranges of the measurement or of
 # the response: those that cancel one another explain anything.
 _FARTHEST = 10.0
-# Longest dead time with which a PI controller holds a process that grows, in time constants of its
-# growth. With a longer one, exp(-D s)/(1 - T s) is about the dead time D - T of any process.
-_HELD = 1.0
+# Longest dead time with which a relay holds a process that grows, in time constants of its growth
+# (Thyagarajan and Yu 2003); a controller then holds it only at the edge of stability. With longer
+# ones, exp(-D s)/(1 - T s) is about the dead time D - T of any process.
+_HELD = math.log(2.0)
 # Gain in a score that changes no choice.
 LITTLE = 0.5
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the

@@ -301,8 +301,8 @@ def start_fopdt(problem: Problem, sign: int = 0) -> list[FloatArray]:
 def start_unstable(problem: Problem) -> list[FloatArray]:
     """Return the best few of a grid of lags and D for a process that grows by itself.
 
-    A controller may hold one that is many times faster than the record is long. No PI holds one
-    whose dead time is longer than the time constant of its growth.
+    A controller may hold one that is many times faster than the record is long, but none whose
+    dead time is longer than the time constant of its growth.
 
     :param problem: with an unstable structure of one lag, or of two.
     """
@@ -392,8 +392,9 @@ def _costs(
         along += np.einsum("dn,dn->d", response, left)
         total += np.einsum("dn,dn->d", left, left)
     power[power == 0.0] = 1.0
-    refused = dead_times > np.minimum(np.where(along < 0.0, *latest), problem.latest)
-    return np.asarray(total - np.where(refused, 0.0, along**2 / power))
+    refused = dead_times > np.where(along < 0.0, *latest)
+    costs = total - np.where(refused, 0.0, along**2 / power)
+    return np.where(dead_times > problem.latest, np.inf, costs)
 
 
 def likeliest_ends(problem: Problem) -> tuple[float, float] | None:
