@@ -485,17 +485,17 @@ def test_a_first_row_of_nothing_is_left_out():
 
 
 def test_a_first_row_from_before_the_sensor_was_ready_is_left_out():
-    """A model that rings for ever had explained it beside a random walk."""
-    rng = np.random.default_rng(4)
+    """A random walk had explained the row and the response."""
+    rng = np.random.default_rng(5)
     time = 0.5 * np.arange(1440.0)
     u = PiecewiseConstant(np.array([30.0]), np.array([30.0]), 0.0)
-    walk = np.cumsum(0.06 * rng.standard_normal(time.size))
+    walk = np.cumsum(0.4 * rng.standard_normal(time.size))
     y = 27.0 + response(TransferFunction.sopdt(5.0, (175.0, 170.0), 1.0), time, u) + walk
     y = np.round(y / 0.25) * 0.25
     y[0] = 3.75
     found = identify_waveform(Record(time, y, u(time), held_input=u))
     assert any("1 of the samples, the first at 0 s" in w for w in found.warnings)
-    assert found.model.gain == pytest.approx(5.0, rel=0.1)
+    assert found.model.gain == pytest.approx(5.0, rel=0.3)
 
 
 def test_a_process_that_falls_is_found_in_a_record_far_longer_than_its_fall():
