@@ -124,7 +124,7 @@ def _beyond(evidence: Evidence) -> Measured | None:
     return Measured(1.0 / float(gain[0]), detail) if gain[0] > 0.0 else None
 
 
-def _direction(evidence: Evidence) -> Measured:
+def _direction(evidence: Evidence) -> Measured | None:
     found, relay = evidence.found, evidence.record.settings is not None
     sign = -found.model.process_sign
     raises, lowers = ("raises", "lowers") if sign > 0 else ("lowers", "raises")
@@ -148,8 +148,10 @@ def _direction(evidence: Evidence) -> Measured:
         for words, draws in models
         if draws
     ]
-    simulated = "a process of the other direction explains the record about as well"
-    return Measured(*max([*shares, (min(found.opposed, 1.0), simulated)]))
+    if found.opposed:
+        as_well = "a process of the other direction explains the record about as well"
+        shares.append((min(found.opposed, 1.0), as_well))
+    return Measured(*max(shares)) if shares else None
 
 
 def _left_out(evidence: Evidence) -> Measured:
