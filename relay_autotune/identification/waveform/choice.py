@@ -213,6 +213,8 @@ def _opposed(context: FitContext, fit: Fit) -> float:
     """
     model = fit.problem.structure.model_at(fit.state.theta, fit.state.coefficients)
     assert model is not None
+    if not model.dead_time > 0.0:
+        return 0.0
     problem = replace(with_terms_of(fit.problem, context.problem), latest=model.dead_time)
     others = replace(context, problem=problem).best_of_direction(-model.process_sign)
     own, total = _typical_squares(fit)
