@@ -331,13 +331,7 @@ class Problem:
         time, structure = self.time[part], self.structure
         first, *further = columns_of(structure, theta, time, self.delayed[number], slopes=slopes)
         blocks = [first]
-        if self.relaxation or structure.unstable:
-            growing_only = not self.relaxation
-            blocks.append(
-                free_motion(
-                    structure.denominator, theta, time, growing_only=growing_only, slopes=slopes
-                )
-            )
+        blocks += self.free_motions(theta, time, slopes=slopes)
         if self.friction:
             at_once = np.append(theta[:-1], 0.0)
             for columns, by_theta in columns_of(
@@ -351,6 +345,23 @@ class Problem:
             return *blocks[0], rest
         columns = np.concatenate([b[0] for b in blocks])
         return columns, np.concatenate([b[1] for b in blocks], axis=1), rest
+
+    def free_motions(
+        self, theta: FloatArray, time: FloatArray, *, slopes: bool = True
+    ) -> list[tuple[FloatArray, FloatArray]]:
+        """Return what a free initial state adds, and derivatives, if any is estimated.
+
+        What grows has one always: its response is followed backward.
+
+        :param theta: shape (m,).
+        :param time: of the samples of one experiment [s], shape (n,).
+        :param slopes: False: without derivatives, m = 0.
+        :return: nothing, or shapes (q, n) and (m, q, n).
+        """
+        if not (self.relaxation or self.structure.unstable):
+            return []
+        of, growing_only = self.structure.denominator, not self.relaxation
+        return [free_motion(of, theta, time, growing_only=growing_only, slopes=slopes)]
 
     @cached_property
     def delayed(self) -> list[Inputs]:

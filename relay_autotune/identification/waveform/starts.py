@@ -23,12 +23,7 @@ from relay_autotune.identification.waveform.problem import (
     is_above,
     pulse,
 )
-from relay_autotune.identification.waveform.rational import (
-    Inputs,
-    columns_of,
-    free_motion,
-    unit_steps,
-)
+from relay_autotune.identification.waveform.rational import Inputs, columns_of, unit_steps
 from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Trial,
@@ -357,7 +352,7 @@ def _costs(
     Half a period later, a limit cycle of the other sign looks much the same: a lag of the wrong
     sign counts as no explanation, as does one that begins after the first response.
     """
-    theta, unstable = np.append(logs, 0.0), problem.structure.unstable
+    theta = np.append(logs, 0.0)
     along, power, total = (np.zeros(dead_times.size) for _ in range(3))
     every = zip(problem.experiments, problem.delayed, problem.lines, strict=True)
     for part, inputs, fixed in every:
@@ -367,14 +362,7 @@ def _costs(
         response, *shifted = (
             shifted_columns(problem.structure, theta, moved, each)[0] for each in inputs.each
         )
-        if problem.relaxation or unstable:
-            free, _ = free_motion(
-                problem.structure.denominator,
-                theta,
-                time,
-                growing_only=not problem.relaxation,
-                slopes=False,
-            )
+        for free, _ in problem.free_motions(theta, time, slopes=False):
             fixed = np.concatenate((fixed, free))
         rows = np.stack(
             [np.broadcast_to(row, moved.shape) for row in (y, response, *fixed, *shifted)]
