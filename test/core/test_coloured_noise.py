@@ -20,7 +20,6 @@ from relay_autotune.identification.waveform import choice
 from relay_autotune.identification.waveform.candidates import (
     Candidate,
     FitContext,
-    nuisances_of,
     support,
 )
 from relay_autotune.identification.waveform.choice import (
@@ -31,7 +30,7 @@ from relay_autotune.identification.waveform.choice import (
     chosen_fit,
 )
 from relay_autotune.identification.waveform.method import identify_waveform
-from relay_autotune.identification.waveform.problem import Problem, problem_of
+from relay_autotune.identification.waveform.problem import Problem, nuisances_of, problem_of
 from relay_autotune.identification.waveform.residuals import Colour, colour_cost, colour_of
 from relay_autotune.identification.waveform.separable import evaluate
 from relay_autotune.identification.waveform.starts import start_fopdt

@@ -16,8 +16,7 @@ from relay_autotune.analysis import analyse, model_so_far
 from relay_autotune.experiment.parameters import ExperimentParameters
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
-from relay_autotune.identification.waveform.candidates import nuisances_of
-from relay_autotune.identification.waveform.problem import problem_of
+from relay_autotune.identification.waveform.problem import nuisances_of, problem_of
 from relay_autotune.process.structures import FOPDT, structure_named
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record

@@ -19,7 +19,14 @@ from typing import Any
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem, pulse
+from relay_autotune.identification.waveform.problem import (
+    NEGLIGIBLE,
+    TERMS,
+    Problem,
+    nuisances_of,
+    pulse,
+    without,
+)
 from relay_autotune.identification.waveform.rational import stepped
 from relay_autotune.identification.waveform.residuals import (
     IMITATES_A_DRIFT,
@@ -77,8 +84,6 @@ _SAMPLES_EACH = 8
 MANY = 6
 # Gains have to hold on the models of these, too.
 PLAIN = (FOPDT.name, SOPDT.name)
-# What may be estimated beside the model, as fields of a problem.
-TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "ends", "friction")
 # Those for which a dead time or a lag can stand.
 _HIDDEN = frozenset(("drift", "relaxation", "past", "ends"))
 # Steps of a fit with a further term or in another colour, and how often a load and ends are moved.
@@ -562,34 +567,6 @@ def _with_terms_in_place(problem: Problem, state: Trial) -> tuple[Problem, Trial
             break
         problem, state = moved, _refit(moved, state)
     return problem, state
-
-
-def nuisances_of(problem: Problem, terms: Iterable[str] = TERMS) -> tuple[bool, ...]:
-    """Return which of some terms beside the model are estimated."""
-    # A load may come at 0 s, which is no False.
-    return tuple(
-        getattr(problem, t) is not False and getattr(problem, t) is not None for t in terms
-    )
-
-
-def without(problem: Problem, terms: Iterable[str]) -> Problem:
-    """Return a problem without some of the terms beside the model.
-
-    :param problem: any.
-    :param terms: some of ``TERMS``.
-    """
-    absent: dict[str, Any] = {t: None if t in ("load", "ends") else False for t in terms}
-    return replace(problem, **absent)
-
-
-def with_terms_of(other: Problem, problem: Problem) -> Problem:
-    """Return a problem with the structure and the terms beside the model of another one.
-
-    :param other: has these.
-    :param problem: has the samples and the colour.
-    """
-    terms = {term: getattr(other, term) for term in TERMS}
-    return replace(problem, structure=other.structure, **terms)
 
 
 def likeliest_load(problem: Problem, state: Trial) -> float:

@@ -30,11 +30,14 @@ from relay_autotune.identification.waveform.candidates import (
     FitContext,
     drop_first_dead_time,
     moves_seldom,
+)
+from relay_autotune.identification.waveform.fit_covariance import Fit, raw_residual
+from relay_autotune.identification.waveform.problem import (
+    NEGLIGIBLE,
+    Problem,
     nuisances_of,
     with_terms_of,
 )
-from relay_autotune.identification.waveform.fit_covariance import Fit, raw_residual
-from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import (
     Colour,

@@ -28,7 +28,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.waveform.candidates import MANY, with_terms_of
+from relay_autotune.identification.waveform.candidates import MANY
 from relay_autotune.identification.waveform.choice import (
     ANSWERED,
     SIMPLE,
@@ -50,6 +50,7 @@ from relay_autotune.identification.waveform.problem import (
     Problem,
     motions_of,
     problem_of,
+    with_terms_of,
 )
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.residuals import scale_of, slow_colour, weights

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -25,6 +25,8 @@ from relay_autotune.record.record import Input, PiecewiseConstant
 NEGLIGIBLE = 1e-10
 # The fractional parts of its multiples are spread evenly, without a period (Weyl 1916).
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+# What may be estimated beside the model, as fields of a problem.
+TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "ends", "friction")
 # Range of a rest, in steps of the sensor, in which nothing moves.
 _A_STEP = 1.5
 # Instants at which a load is tried.
@@ -528,6 +530,34 @@ def _shown_play(u: Input, time: FloatArray, *, held: bool) -> float:
     if not (differ or np.intersect1d(level[direction > 0.0], level[direction < 0.0]).size):
         return 0.0
     return float(ways.min())
+
+
+def nuisances_of(problem: Problem, terms: Iterable[str] = TERMS) -> tuple[bool, ...]:
+    """Return which of some terms beside the model are estimated."""
+    # A load may come at 0 s, which is no False.
+    return tuple(
+        getattr(problem, t) is not False and getattr(problem, t) is not None for t in terms
+    )
+
+
+def without(problem: Problem, terms: Iterable[str]) -> Problem:
+    """Return a problem without some of the terms beside the model.
+
+    :param problem: any.
+    :param terms: some of ``TERMS``.
+    """
+    absent: dict[str, Any] = {t: None if t in ("load", "ends") else False for t in terms}
+    return replace(problem, **absent)
+
+
+def with_terms_of(other: Problem, problem: Problem) -> Problem:
+    """Return a problem with the structure and the terms beside the model of another one.
+
+    :param other: has these.
+    :param problem: has the samples and the colour.
+    """
+    terms = {term: getattr(other, term) for term in TERMS}
+    return replace(problem, structure=other.structure, **terms)
 
 
 def problem_of(
