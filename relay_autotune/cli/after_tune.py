@@ -430,6 +430,8 @@ class AfterTune(Tuned):
         )
 
 
-def _positive(text: str) -> float | None:
+def _positive(text: str) -> float:
     value = number_of(text)
-    return value if value is not None and value > 0.0 else None
+    if value is None or value <= 0.0:
+        raise SelectionError("expected a number, such as 0.1")
+    return value

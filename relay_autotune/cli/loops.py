@@ -383,7 +383,7 @@ class TopicLoop(Loop):
                 )
             print("\n".join(broken(problem, width())), file=sys.stderr)
             what = "the number that measures"
-            options.field = asked(what, "--field", first, first, lambda text: text or None)
+            options.field = asked(what, "--field", first, first, str)
 
     @property
     def title(self) -> str:

@@ -387,16 +387,18 @@ class Answers:
             example = "{:g} {:g}".format(*_around(self._seen(name)))
 
         def read(text: str) -> Any:
-            if (unit := unit_of(text)) and setting.read(text) is not None:
+            if (value := setting.read(text)) is None:
+                found = "two numbers, the lower one first" if setting.ends > 1 else "a number"
+                raise SelectionError(f"expected {found}, such as {example}")
+            if unit := unit_of(text):
                 UNITS[setting.unit] = unit
-            return setting.read(text)
+            if why := self.why_impossible(name, value):
+                raise SelectionError(why)
+            return value
 
         lacking = ", ".join(flag_of(each) for each in self._asked if self[each.name] is None)
-        value = asked(
-            f"{setting.question} [{setting.unit}]" + f", {seen}" * bool(seen),
-            lacking, "", example, read,
-            lambda found: self.why_impossible(name, found), pair=setting.ends > 1, back=back,
-        )  # fmt: skip
+        what = f"{setting.question} [{setting.unit}]" + f", {seen}" * bool(seen)
+        value = asked(what, lacking, "", example, read, back=back)
         self.take({name: value}, "typed")
 
     def form(self, names: Sequence[str], *, needed: bool) -> Iterator[dict[str, Any]]:

@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from relay_autotune.errors import LoopError, RelayAutotuneError, SelectionError, system_says
 from relay_autotune.text import LOGGED_EVERY, PROGRESS_EVERY, duration, in_units, visible
@@ -27,7 +27,7 @@ from relay_autotune.text import LOGGED_EVERY, PROGRESS_EVERY, duration, in_units
 if TYPE_CHECKING:
     from relay_autotune.control.step_choice import StepRange
 
-
+_Value = TypeVar("_Value")
 # Longer lines are hard to read, also where the terminal is wider.
 WIDEST = 99
 NARROWEST = 40
@@ -310,9 +310,8 @@ def asked_for_file(what: str, names: Collection[str]) -> str:
     :param what: what would be written.
     :param names: programs that may be named in its place.
     """
-    _forget_typed()
-    while True:
-        answer = _input(f"{what}: file name, or another program [none]: ")
+
+    def read(answer: str) -> str:
         if answer.lower() in ("", "n", "no", "none"):
             return ""
         program = answer.lower().replace("-", "_").replace(" ", "_")
@@ -322,15 +321,18 @@ def asked_for_file(what: str, names: Collection[str]) -> str:
         # A word with neither folder nor ending is a program that was mistyped.
         if file.suffix or os.sep in answer:
             return str(file)
-        problem = (
+        raise SelectionError(
             f"{answer} is neither a program nor the name of a file: expected a file with its "
             f"ending, such as gains.yaml, Enter for none, or one of {', '.join(names)}"
         )
-        print("\n".join(broken(problem, width())), file=sys.stderr)
+
+    _forget_typed()
+    return _answer(f"{what}: file name, or another program [none]: ", read)
 
 
 # What goes back to the question before.
 BACK = "<"
+_YES_OR_NO = {"": False, "n": False, "no": False, "y": True, "yes": True}
 
 
 class GoBack(Exception):  # noqa: N818  it is no error
@@ -348,15 +350,15 @@ def agrees(question: str, *, yes: bool, back: bool = False) -> bool:
     """
     if yes:
         return True
+
+    def read(answer: str) -> bool:
+        if answer.lower() in _YES_OR_NO:
+            return _YES_OR_NO[answer.lower()]
+        raise SelectionError("expected y or n")
+
     _require_somebody("--yes")
     _forget_typed()
-    while True:
-        answer = _input(f"\n{question} [y/N] ").lower()
-        if back and answer == BACK:
-            raise GoBack
-        if answer in ("", "n", "no", "y", "yes"):
-            return answer.startswith("y")
-        print("expected y or n", file=sys.stderr)
+    return _answer(f"\n{question} [y/N] ", read, back=back)
 
 
 def end_with_terminal() -> None:
@@ -441,18 +443,19 @@ def agreed_step(question: str, step: float, allowed: StepRange) -> float:
     :param allowed: the heights that may be typed in its place.
     :raises LoopError: if nobody can be asked.
     """
+
+    def read(answer: str) -> float:
+        if answer.lower() in _YES_OR_NO:
+            return step if _YES_OR_NO[answer.lower()] else 0.0
+        other = number_of(answer)
+        if other is None or not allowed.allows(other):
+            raise SelectionError(f"expected y, n, or the height of the step, {allowed.words}")
+        return other
+
     _require_somebody("--yes")
     print("\n" + "\n".join(broken(question, width())))
     _forget_typed()
-    while True:
-        answer = _input(f"[y/N, or another step, such as {0.5 * step:.2g}] ").lower()
-        if answer in ("", "n", "no", "y", "yes"):
-            return step if answer.startswith("y") else 0.0
-        other = number_of(answer)
-        if other is not None and allowed.allows(other):
-            return other
-        problem = f"expected y, n, or the height of the step, {allowed.words}"
-        print("\n".join(broken(problem, width())), file=sys.stderr)
+    return _answer(f"[y/N, or another step, such as {0.5 * step:.2g}] ", read)
 
 
 def asked(
@@ -460,37 +463,41 @@ def asked(
     flag: str,
     known: str,
     example: str,
-    read: Callable[[str], Any],
-    why_impossible: Callable[[Any], str] = lambda _: "",
+    read: Callable[[str], _Value],
     *,
-    pair: bool = False,
     back: bool = False,
-) -> Any:
+) -> _Value:
     """Ask for a value until it can be read and can be.
 
     :param what: what is asked for, with its unit.
     :param flag: the flag that would have given it, with those of the questions that follow.
     :param known: the value that Enter takes; empty: none.
     :param example: what may be typed.
-    :param read: returns the value of a text; None: it has none.
-    :param why_impossible: tells why a value cannot be; empty: it can.
-    :param pair: whether two numbers are asked for.
+    :param read: as of `_answer`.
     :param back: whether there is a question before.
     :raises GoBack: if that is to be asked again.
     """
     _require_somebody(flag)
     shown = f"{in_units(what, UNITS)}, such as {example}" + f" [{known}]" * bool(known) + ": "
+    return _answer(shown, lambda text: read(text or known), back=back)
+
+
+def _answer(shown: str, read: Callable[[str], _Value], *, back: bool = False) -> _Value:
+    """Return what an answer means; one that is refused is asked for again.
+
+    :param shown: the prompt.
+    :param read: returns the meaning of a text, or raises a SelectionError with what is expected.
+    :param back: whether there is a question before.
+    :raises GoBack: if that is to be asked again.
+    """
     while True:
-        text = _input(shown) or known
+        text = _input(shown)
         if back and text == BACK:
             raise GoBack
-        value = read(text)
-        if value is None:
-            found = "two numbers, the lower one first" if pair else "a number"
-            said = f"expected {found}, such as {example}"
-        elif not (said := why_impossible(value)):
-            return value
-        print("\n".join(broken(said, width())), file=sys.stderr)
+        try:
+            return read(text)
+        except SelectionError as error:
+            print("\n".join(broken(str(error), width())), file=sys.stderr)
 
 
 def _require_somebody(flag: str) -> None:
