@@ -282,10 +282,15 @@ def as_typed(options: argparse.Namespace, **changed: Any) -> str:
             continue
         written.add(action.dest)
         words = [_typed(each) for each in (value if isinstance(value, list) else [value])]
-        if not action.option_strings:
+        option = action.option_strings[-1] if action.option_strings else ""
+        if not option:
             given += words
+        elif action.nargs is None:
+            # One that may be given several times has its name before each value.
+            for word in words:
+                flags += [option, word]
         else:
-            flags += [action.option_strings[-1], *(words if action.nargs != 0 else [])]
+            flags += [option, *(words if action.nargs else [])]
     return shlex.join([options.parser.prog, *given, *flags])
 
 

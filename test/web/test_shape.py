@@ -200,7 +200,8 @@ def test_what_cannot_be_asked_is_refused(fields):
 def test_the_command_line_that_is_shown_gives_the_same_again(tmp_path):
     parser = replay._parser()
     bag = str(REPOSITORY / "bags" / "biased_relay")
-    options = parser.parse_args(["--web", "--pi", "--present", "0.4", "20", "0", bag])
+    joints = ["--joint", "left", "--joint", "right"]
+    options = parser.parse_args(["--web", "--pi", "--present", "0.4", "20", "0", *joints, bag])
     asked = vars(DesignRequest("robust", "pid", 1.62, 0.3))
     typed = as_typed(options, web=None, web_address=None, **asked)
     words = shlex.split(typed)
@@ -209,6 +210,8 @@ def test_the_command_line_that_is_shown_gives_the_same_again(tmp_path):
     assert (again.controller, again.ms, again.setpoint_weight) == ("pid", 1.62, 0.3)
     assert again.present == [0.4, 20.0, 0.0]
     assert again.bags == [bag]
+    # The second one had stood alone, where it is another recording.
+    assert again.joint == ["left", "right"]
     assert not again.web
 
 
