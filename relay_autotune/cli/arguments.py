@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
-from typing import Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from relay_autotune.cli.terminal import Help, broken, end_with_terminal, width
 from relay_autotune.errors import (
@@ -29,6 +29,9 @@ from relay_autotune.errors import (
 )
 from relay_autotune.quantities import Quantity
 from relay_autotune.text import visible
+
+if TYPE_CHECKING:
+    from relay_autotune.web.address import Address
 
 DONE, NOTHING_FOUND, USAGE, DOUBTFUL = 0, 1, 2, 3
 # From best to worst; a command for several bags ends with the worst of their statuses.
@@ -298,9 +301,6 @@ def _typed(value: Any) -> str:
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
-_LOOPBACK = "127.0.0.1"
-
-
 def add_web(
     parser: argparse.ArgumentParser,
     what: str = "also serve a page to shape the gains, until Ctrl-C",
@@ -313,22 +313,20 @@ def add_web(
     group = parser.add_argument_group("a page in the browser")
     group.add_argument("--web", action="store_true", help=what)
     group.add_argument(
-        "--web-address", type=_address, default=_LOOPBACK, metavar="HOST[:PORT]",
-        help="where it is served (%(default)s, any free port); other than on this machine's own "
+        "--web-address", type=_address, metavar="HOST[:PORT]",
+        help="where it is served (127.0.0.1, any free port); other than on this machine's own "
         "address it asks for a token, which is part of the address that is printed",
     )  # fmt: skip
 
 
-def _address(text: str) -> str:
+def _address(text: str) -> Address:
     # What reads an address takes a while to load.
-    if text != _LOOPBACK:
-        from relay_autotune.web.address import address_of
+    from relay_autotune.web.address import address_of
 
-        try:
-            address_of(text)
-        except SelectionError as error:
-            raise argparse.ArgumentTypeError(str(error)) from error
-    return text
+    try:
+        return address_of(text)
+    except SelectionError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def check_web(options: argparse.Namespace) -> None:
@@ -338,7 +336,7 @@ def check_web(options: argparse.Namespace) -> None:
     :raises SelectionError: if there is an address alone.
     :raises MissingPackageError: if the package that serves a page is not installed.
     """
-    if not options.web and options.web_address != _LOOPBACK:
+    if options.web_address and not options.web:
         raise SelectionError("--web-address is that of a page: give --web, too")
     if options.web and importlib.util.find_spec("tornado") is None:
         raise MissingPackageError(

@@ -547,7 +547,7 @@ def show(options: argparse.Namespace, models: Sequence[tuple[Case, Shaping | Non
     :raises SelectionError: if the address cannot be used.
     """
     # Imported here: tornado is for --web alone.
-    from relay_autotune.web.address import address_of
+    from relay_autotune.web.address import Address
     from relay_autotune.web.server import Page, run
     from relay_autotune.web.shape import DesignRequest, PageModel
 
@@ -566,7 +566,7 @@ def show(options: argparse.Namespace, models: Sequence[tuple[Case, Shaping | Non
 
     subjects = [subject(case, shaping) for case, shaping in models]
 
-    page = Page(subjects, address_of(options.web_address))
+    page = Page(subjects, options.web_address or Address())
     units = [case.units for case, _ in models]
     if all(each == units[0] for each in units):
         page.units = units[0]

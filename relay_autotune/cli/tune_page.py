@@ -41,7 +41,7 @@ from relay_autotune.experiment.early_end import ULTIMATE_GAIN
 from relay_autotune.process.transfer_function import process_text
 from relay_autotune.report.case import Case, EstimatedQuantity, case_of, ultimate_of
 from relay_autotune.result import Analysis
-from relay_autotune.web.address import address_of
+from relay_autotune.web.address import Address
 from relay_autotune.web.live import (
     START,
     Live,
@@ -68,7 +68,8 @@ def serve(loops: Sequence[Loop], options: argparse.Namespace, interrupted: list[
     :return: the worst exit status that the last tune of a loop deserves.
     :raises LoopError: if a relay_node is lost during a tune; the other loops go on until the end.
     """
-    page = Page((), address_of(options.web_address), [Live(loop.title) for loop in loops])
+    address = options.web_address or Address()
+    page = Page((), address, [Live(loop.title) for loop in loops])
     page.units = UNITS
     shown = [_LoopOnPage(loop, page, n, interrupted) for n, loop in enumerate(loops)]
     with in_background(page) as url:
