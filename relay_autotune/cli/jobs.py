@@ -9,6 +9,7 @@ It is the same in this process, in another one and on another host.
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import re
 import shlex
@@ -35,6 +36,7 @@ from relay_autotune.cli.table import compared_lines, heading, rows, table
 from relay_autotune.cli.terminal import WIDEST, Working
 from relay_autotune.errors import NotThereError, RelayAutotuneError, SelectionError, defect
 from relay_autotune.exchange.export import EXPORTS, Target, exported
+from relay_autotune.expected_time import expected_time
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.loop.gains import FORMS, Controller, Gains
@@ -119,19 +121,19 @@ def work(job: Job) -> Done:
 
     :param job: what to do.
     """
-    return replace(replay(job), analyses=())
+    return replace(replay(job, quiet=True), analyses=())
 
 
-def replay(job: Job, working: Working | None = None) -> Done:
+def replay(job: Job, *, quiet: bool) -> Done:
     """Read, identify and tune; an error becomes part of the result.
 
     :param job: what to do.
-    :param working: shows how much of a bag is read, and what the computation is at.
+    :param quiet: as of `analysed`.
     """
     said: list[str] = []
     analyses: tuple[Analysis, ...] = ()
     try:
-        analyses = analysed(job, said, working)
+        analyses = analysed(job, said, quiet=quiet)
         if job.export is None:
             text = _text(job, analyses)
         else:
@@ -173,37 +175,36 @@ def status_of(analyses: Sequence[Analysis]) -> int:
     )
 
 
-def analysed(job: Job, said: list[str], working: Working | None = None) -> tuple[Analysis, ...]:
+def analysed(job: Job, said: list[str], *, quiet: bool) -> tuple[Analysis, ...]:
     """Read, identify and tune.
 
     :param job: what to do.
     :param said: gets sentences for standard error.
-    :param working: shows how much of a bag is read, and what the computation is at.
+    :param quiet: False: it is said how much of a bag is read, and what the computation is at.
     :raises RelayAutotuneError: if the recording cannot be read, or lacks what is asked for.
     """
-    progress = working.share if working else None
     records: list[Record] = []
     # Those of one process are read one by one, others are one timeline.
     groups = [(path,) for path in job.paths] if job.jointly else [job.paths]
-    for paths in groups:
-        try:
-            recording = read_experiments(paths, job.selection, progress)
-        except NotThereError as error:
-            if not job.among_others:
-                raise
-            said.append(f"{error.lacking}: it is read by its own names")
-            own = replace(job.selection, measurement=None, command=None, time=None)
-            recording = read_experiments(paths, own, progress)
-        name = paths[0] if job.jointly else job.name
-        said += [f"{name}: {note}" for note in recording.notes]
-        records += recording.experiments
-    if working is not None:
-        working.begin(map(len, records))
-    if job.jointly:
-        return (analyse_jointly(records, **vars(job.task)),)
-    tell = working.at if working else lambda _: None
-    found = tuple(analyse(each, **vars(job.task), tell=tell) for each in records)
-    return agreed(found) if recording.of_one_process else found
+    with Working(f"reading {job.name}", patient=True, quiet=quiet) as reading:
+        for paths in groups:
+            try:
+                recording = read_experiments(paths, job.selection, reading.share)
+            except NotThereError as error:
+                if not job.among_others:
+                    raise
+                said.append(f"{error.lacking}: it is read by its own names")
+                own = replace(job.selection, measurement=None, command=None, time=None)
+                recording = read_experiments(paths, own, reading.share)
+            name = paths[0] if job.jointly else job.name
+            said += [f"{name}: {note}" for note in recording.notes]
+            records += recording.experiments
+    expected = math.nan if quiet else expected_time(*map(len, records))
+    with Working("computing the model", expected, quiet=quiet) as working:
+        if job.jointly:
+            return (analyse_jointly(records, **vars(job.task)),)
+        found = tuple(analyse(each, **vars(job.task), tell=working.at) for each in records)
+        return agreed(found) if recording.of_one_process else found
 
 
 def _exported(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -286,10 +285,7 @@ def _as_they_come(
         yield from in_processes(jobs, options.jobs)
     else:
         for number, job in enumerate(jobs):
-            shown = Working(f"reading {job.name}", patient=True) if alone else nullcontext()
-            with shown as working:
-                found = replay(job, working)
-            yield number, found
+            yield number, replay(job, quiet=not alone)
 
 
 def _tell(done: Done) -> None:

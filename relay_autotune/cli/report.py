@@ -32,7 +32,6 @@ from relay_autotune.cli.arguments import (
     worst,
 )
 from relay_autotune.cli.jobs import Job, add_analysis, add_details, analysed, jobs_of, present_of
-from relay_autotune.cli.terminal import Working
 from relay_autotune.errors import BagError, RelayAutotuneError, SelectionError, os_errors_as
 from relay_autotune.report import PICTURES, is_ours, write_figures, write_page, write_picture
 
@@ -238,8 +237,7 @@ def _cases(job: Job) -> list[Case]:
 
     said: list[str] = []
     try:
-        with Working(f"reading {job.name}", patient=True) as working:
-            found = analysed(job, said, working)
+        found = analysed(job, said, quiet=False)
         return [case_of(analysis, job.name) for analysis in found]
     finally:
         for sentence in said:

@@ -16,7 +16,7 @@ import termios
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -232,34 +232,31 @@ class Working:
     :param what: what is being done.
     :param expected: how long it takes about [s]; NaN: not known.
     :param patient: True: without a terminal it is not said before ten seconds.
+    :param quiet: True: nothing is said.
     """
 
-    def __init__(self, what: str, expected: float = math.nan, *, patient: bool = False) -> None:
+    def __init__(
+        self,
+        what: str,
+        expected: float = math.nan,
+        *,
+        patient: bool = False,
+        quiet: bool = False,
+    ) -> None:
         self._what, self._expected, self._patient = what, expected, patient
-        self._stage = ""
+        self._quiet, self._stage = quiet, ""
 
     def __enter__(self) -> Self:
         self._over, self._line = threading.Event(), StatusLine()
         self._thread = threading.Thread(target=self._tell, name="progress", daemon=True)
-        self._thread.start()
+        if not self._quiet:
+            self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._over.set()
-        self._thread.join()
-
-    def begin(self, samples: Iterable[int]) -> None:
-        """Compute models from now on.
-
-        :param samples: number of samples of each record.
-        """
-        # Imported here, because a question needs no arrays.
-        from relay_autotune.expected_time import expected_time
-
-        self.__exit__()
-        self._what, self._expected = "computing the model", expected_time(*samples)
-        self._stage, self._patient = "", False
-        self.__enter__()
+        if not self._quiet:
+            self._thread.join()
 
     def at(self, stage: str) -> None:
         """Note what the work is at; any thread may call it.

@@ -23,7 +23,7 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
@@ -170,7 +170,7 @@ class Session:
             what = (options.joint or options.measurement, options.controller or options.command)
             sentence = f"looking at {what[0]} and {what[1]}; nothing is commanded yet"
             print(sentence, file=sys.stderr, flush=True)
-        with Working("loading what talks to the nodes") if starts else nullcontext():
+        with Working("loading what talks to the nodes", quiet=not starts):
             import relay_autotune.nodes.tune_client  # noqa: F401  see Signals
         if starts or options.dry_run:
             # Nothing commands the process before the plan is agreed to: Ctrl-C may end it here.

@@ -67,7 +67,7 @@ def test_a_doubt_marks_the_gains_in_table_document_page_and_message(monkeypatch)
 def test_doubtful_gains_that_are_not_exported_have_the_status_of_doubtful_gains(
     monkeypatch, capsys
 ):
-    monkeypatch.setattr(jobs, "analysed", lambda *_: (doubted(),))
+    monkeypatch.setattr(jobs, "analysed", lambda *_, **__: (doubted(),))
     asked = ["--export", "yaml", "bags/biased_relay"]
     assert replay.main(asked) == DOUBTFUL
     told = capsys.readouterr()
