@@ -12,12 +12,12 @@ import mimetypes
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from functools import partial
 from http import HTTPStatus
 from importlib.resources import files
-from threading import Lock, Thread
+from socket import socket
+from threading import Event, Lock, Thread
 from typing import Any
 from urllib.parse import parse_qs
 
@@ -218,8 +218,8 @@ class Page:
             news = live.news()
             if news is not None:
                 text = wire.to_text({"loop": number} | news)
-                for socket in list(self.open):
-                    socket.tell(text)
+                for connection in list(self.open):
+                    connection.tell(text)
 
 
 class _Guarded(RequestHandler):
@@ -528,11 +528,38 @@ def _log_in_lines() -> None:
         logger.handlers, logger.propagate = [lines], False
 
 
-async def serve(page: Page, tell: Callable[[str], None]) -> None:
+async def _serve(page: Page, sockets: Sequence[socket]) -> None:
     """Serve a page until the task is cancelled.
 
     :param page: what is shown.
-    :param tell: called with the address to open.
+    :param sockets: that listen for browsers.
+    """
+    yield_to_nodes(_NICE)
+    _log_in_lines()
+    server = HTTPServer(application(page), max_body_size=_LARGEST_QUESTION)
+    server.add_sockets(sockets)
+    regular = [
+        PeriodicCallback(work, 1000.0 * _LIVE_EVERY) for work in (page.tell_news, page.tend)
+    ]
+    for each in regular:
+        each.start()
+    with suppress(asyncio.CancelledError):
+        await asyncio.Event().wait()
+    page.tell_news()
+    for each in regular:
+        each.stop()
+    page.close()
+    server.stop()
+    for connection in list(page.open):
+        connection.close(1001, "the command has ended")
+    await server.close_all_connections()
+
+
+@contextmanager
+def in_background(page: Page) -> Iterator[str]:
+    """Serve a page from a thread, and yield what to open.
+
+    :param page: what is shown.
     :raises SelectionError: if the address cannot be used.
     """
     address = page.address
@@ -543,26 +570,16 @@ async def serve(page: Page, tell: Callable[[str], None]) -> None:
             f"the page cannot be served on {address.host}:{address.port}: {error.strerror}; "
             "name another with --web-address"
         ) from error
-    _log_in_lines()
-    server = HTTPServer(application(page), max_body_size=_LARGEST_QUESTION)
-    server.add_sockets(sockets)
-    tell(address.url(sockets[0].getsockname()[1]))
-    regular = [
-        PeriodicCallback(work, 1000.0 * _LIVE_EVERY) for work in (page.tell_news, page.tend)
-    ]
-    for each in regular:
-        each.start()
+    loop = asyncio.new_event_loop()
+    task = loop.create_task(_serve(page, sockets))
+    # It ends with the process also where this block is left by a second Ctrl-C.
+    thread = Thread(target=loop.run_until_complete, args=(task,), name="server", daemon=True)
+    thread.start()
     try:
-        await asyncio.Event().wait()
+        yield address.url(sockets[0].getsockname()[1])
     finally:
-        page.tell_news()
-        for each in regular:
-            each.stop()
-        page.close()
-        server.stop()
-        for socket in list(page.open):
-            socket.close(1001, "the command has ended")
-        await server.close_all_connections()
+        loop.call_soon_threadsafe(task.cancel)
+        thread.join(_ENDS_WITHIN)
 
 
 def run(page: Page, tell: Callable[[str], None]) -> None:
@@ -572,35 +589,6 @@ def run(page: Page, tell: Callable[[str], None]) -> None:
     :param tell: called with the address to open.
     :raises SelectionError: if the address cannot be used.
     """
-    with suppress(KeyboardInterrupt):
-        asyncio.run(serve(page, tell))
-
-
-@contextmanager
-def in_background(page: Page) -> Iterator[str]:
-    """Serve a page from a thread, and yield what to open.
-
-    :param page: what is shown.
-    :raises SelectionError: if the address cannot be used.
-    """
-    loop = asyncio.new_event_loop()
-    address: Future[str] = Future()
-
-    async def until_cancelled() -> None:
-        yield_to_nodes(_NICE)
-        try:
-            await serve(page, address.set_result)
-        except asyncio.CancelledError:
-            return
-        except SelectionError as error:
-            address.set_exception(error)
-
-    task = loop.create_task(until_cancelled())
-    # It ends with the process also where this block is left by a second Ctrl-C.
-    thread = Thread(target=loop.run_until_complete, args=(task,), name="server", daemon=True)
-    thread.start()
-    try:
-        yield address.result()
-    finally:
-        loop.call_soon_threadsafe(task.cancel)
-        thread.join(_ENDS_WITHIN)
+    with in_background(page) as url, suppress(KeyboardInterrupt):
+        tell(url)
+        Event().wait()

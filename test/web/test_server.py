@@ -24,7 +24,7 @@ from relay_autotune.errors import SelectionError
 from relay_autotune.verdict import Judgement
 from relay_autotune.web.address import Address, address_of
 from relay_autotune.web.live import Live
-from relay_autotune.web.server import Page, serve
+from relay_autotune.web.server import Page, in_background
 from relay_autotune.web.shape import DesignRequest, PageModel
 
 
@@ -313,5 +313,5 @@ def test_what_is_no_address_is_refused(text):
 def test_an_address_that_is_taken_is_refused_in_one_line(url, subject):
     port = int(url.rsplit(":")[-1].strip("/"))
     page = Page([subject], Address("127.0.0.1", port))
-    with pytest.raises(SelectionError, match="--web-address"):
-        asyncio.run(serve(page, lambda _: None))
+    with pytest.raises(SelectionError, match="--web-address"), in_background(page):
+        pass
