@@ -104,7 +104,6 @@ def of_subject(subject: PageModel) -> dict[str, Any]:
         "rules": [{"rule": g.rule, "ms": short(np.array([g.ms, g.iae_load]))} for g in case.gains],
         "present": of_present(subject),
         "may_shape": subject.shaping is not None,
-        "around": len(subject.shaping.task.models) if subject.shaping is not None else 0,
         "first": vars(subject.first),
         "slider": [CALM, FAST, STEP],
         "amplitude": _noisy_amplitude(subject.shaping),

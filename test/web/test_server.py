@@ -89,7 +89,6 @@ def test_the_socket_tells_everything_and_answers(url, subject):
         {"of": 0, "n": 8, "asked": {"rule": "unstable"}},
     )
     assert first["subjects"][0]["name"] == "a bag"
-    assert first["subjects"][0]["around"] == len(subject.case.model.draws)
     assert answer["n"] == 7
     shaped = subject.shaped(DesignRequest(controller="pi", ms=1.6))
     assert answer["answer"]["shaped"]["isa"][0][1] == f"{shaped.gains.kc:.4f}"
