@@ -70,6 +70,8 @@ _FLAGS = (
     *("natural_frequency", "damping", "numerator", "denominator"),
 )
 _NUMBERS_OF_MODEL = ("gain", "dead_time", "natural_frequency", "damping")
+# Equal lags that a model may have: with more a design would take minutes.
+_MOST_LAGS = 1000
 
 
 def model_of(options: argparse.Namespace) -> TransferFunction:
@@ -109,7 +111,7 @@ def _built(given: dict[str, Any]) -> TransferFunction:
     numbers: dict[str, Any] = {n: _number(n, given.get(n, 0.0)) for n in _NUMBERS_OF_MODEL}
     gain, dead_time = numbers["gain"], numbers["dead_time"]
     zeros, lags = (_constants(name, given.get(name)) for name in ("zeros", "time_constants"))
-    order, integrators = int(given.get("order") or 0), int(given.get("integrators") or 0)
+    order, integrators = (_count(name, given.get(name) or 0) for name in ("order", "integrators"))
     numerator, denominator = (
         _coefficients(name, given[name]) if given.get(name) is not None else None
         for name in ("numerator", "denominator")
@@ -230,6 +232,12 @@ def _number(name: str, value: Any) -> float:
         return float(value)
     except OverflowError:
         raise SelectionError(f"{name} is beyond the numbers of a computer") from None
+
+
+def _count(name: str, value: Any) -> int:
+    if problem := Quantity(name, 0, lower=0, upper=_MOST_LAGS).problem(value):
+        raise SelectionError(problem)
+    return int(value)
 
 
 def _constants(name: str, values: Any) -> tuple[complex, ...]:

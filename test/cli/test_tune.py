@@ -313,6 +313,19 @@ def test_refusals_are_one_line_and_no_gains(flags, status, said, capsys):
         ('{"gain": "2", "time_constants": [1]}', "gain must be a number, found '2'"),
         ('{"gain": 2, "time_constants": [true]}', "time_constants must be a number"),
         ('{"gain": null, "time_constants": [1]}', "gain must be a number, found None"),
+        (
+            '{"gain": 1, "time_constants": [1], "order": "two"}',
+            "order is 'two', expected from 0 to 1000",
+        ),
+        (
+            '{"gain": 1, "time_constants": [1], "order": 2.7}',
+            "order is 2.7, expected a whole number",
+        ),
+        (
+            '{"gain": 1, "time_constants": [1], "integrators": 1e400}',
+            "integrators is inf, expected a finite number",
+        ),
+        ('{"gain": 1, "time_constants": [1], "integrators": -1}', "integrators is -1, expected"),
         ('{"numerator": 1, "denominator": [1, 1]}', "numerator must be a list"),
         (
             '{"gain": 1, "time_constants": [20], "deadtime": 10}',
