@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -137,6 +138,21 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         **_defaults_of(Cycle),
     },
 }
+
+
+def _messages(topics: Topics, type_name: str) -> list[Any]:
+    """Return the messages of one of our types, with defaults of the fields that they lack."""
+    return [_with_defaults(each, DEFAULTS[type_name]) for each in topics.decoded(type_name)]
+
+
+def _with_defaults(message: Any, defaults: Mapping[str, Any]) -> SimpleNamespace:
+    fields = dict(vars(message)) if message is not None else {}
+    for name, default in defaults.items():
+        if isinstance(default, Mapping):
+            fields[name] = _with_defaults(fields.get(name), default)
+        else:
+            fields.setdefault(name, default)
+    return SimpleNamespace(**fields)
 
 
 def _of_topics(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]]:
@@ -323,7 +339,7 @@ def recorded_experiments(topics: Topics) -> tuple[list[Record], list[str]]:
     """
     records: dict[str, Record] = {}
     refused: list[str] = []
-    for number, message in enumerate(topics.decoded(EXPERIMENT, DEFAULTS[EXPERIMENT])):
+    for number, message in enumerate(_messages(topics, EXPERIMENT)):
         key = str(message.experiment_id) or f"number {number}"
         try:
             records.setdefault(key, record_from_message(message))
@@ -364,7 +380,7 @@ def _rebuilt(topics: Topics, about: Mapping[str, str]) -> Record:
     answer = answer[answered]
     taken = samples.publish_time[answered]
     origin = int(taken[0])
-    cycles = unbroken(topics.decoded(CYCLE, DEFAULTS[CYCLE]))
+    cycles = unbroken(_messages(topics, CYCLE))
     try:
         return Record(
             time=(taken - origin) / 1e9,

@@ -12,7 +12,7 @@ fixed size do, a place is one number; else it is one for each message.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.bag.arrays import IntArray
-from relay_autotune.bag.definitions import Channel, first_line, message_type
+from relay_autotune.bag.definitions import first_line
 from relay_autotune.bag.field_path import (
     NUMBERS,
     Element,
@@ -87,7 +87,7 @@ class Path:
         :param message: serialized.
         """
         try:
-            reading(self.steps)(decoded_message(self.root, message))
+            reading(self.steps)(Decoder(self.root).decoded(message))
         except FieldError as error:
             return str(error)
         except BagError:
@@ -337,38 +337,7 @@ class _Cursor:
                 return
 
 
-def decode_messages(
-    channel: Channel, payload: Iterable[bytes], defaults: Mapping[str, Any]
-) -> list[Any]:
-    """Decode messages by the definition in their bag.
-
-    :param channel: the channel of the messages.
-    :param payload: the serialized messages.
-    :param defaults: values of the fields that an older definition lacks, by their names.
-    :return: objects with the fields as attributes, more than today's if the bag has more.
-    :raises BagError: if the definition or a message makes no sense.
-    """
-    if channel.encoding != "cdr" or channel.schema_encoding != "ros2msg":
-        raise BagError(
-            f"{channel.topic} is encoded as {channel.encoding!r} with a definition in "
-            f"{channel.schema_encoding!r}; expected 'cdr' with 'ros2msg'"
-        )
-    decoder = _Decoder(message_type(channel), f" of {channel.topic}")
-    return [_with_defaults(decoder.decoded(data), defaults) for data in payload]
-
-
-def decoded_message(root: Struct, data: bytes) -> Any:
-    """Decode one message of any type.
-
-    :param root: its type.
-    :param data: the serialized message.
-    :return: an object with the fields as attributes.
-    :raises BagError: if it does not fit its type.
-    """
-    return _Decoder(root).decoded(data)
-
-
-class _Decoder:
+class Decoder:
     """Decodes messages of a type, with a limit on the structures and elements in all of them.
 
     :param root: the type.
@@ -380,10 +349,10 @@ class _Decoder:
         self._left = MOST_ELEMENTS
 
     def decoded(self, data: bytes) -> Any:
-        """Return a message in plain CDR as an object; bytes after its end are allowed.
+        """Return a message in plain CDR as an object with the fields as attributes.
 
-        ROS 2's own serialization leaves some there: it makes room for the alignment of a
-        sequence's elements even if the sequence is empty.
+        Bytes after its end are allowed. ROS 2's own serialization leaves some there: it makes
+        room for the alignment of a sequence's elements even if the sequence is empty.
 
         :param data: the serialized message.
         :raises BagError: if it does not fit its type.
@@ -447,13 +416,3 @@ class _Decoder:
 
     def _align(self, size: int) -> None:
         self._at = (self._at + size - 1) & -size
-
-
-def _with_defaults(message: Any, defaults: Mapping[str, Any]) -> SimpleNamespace:
-    fields = dict(vars(message)) if message is not None else {}
-    for name, default in defaults.items():
-        if isinstance(default, Mapping):
-            fields[name] = _with_defaults(fields.get(name), default)
-        else:
-            fields.setdefault(name, default)
-    return SimpleNamespace(**fields)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from relay_autotune.bag.arrays import FloatArray, IntArray
 from relay_autotune.bag.bag_file import BagFile
-from relay_autotune.bag.cdr import Path, decode_messages, decoded_message
+from relay_autotune.bag.cdr import Decoder, Path
 from relay_autotune.bag.definitions import Channel, message_type
 from relay_autotune.bag.field_path import (
     UNITS,
@@ -143,7 +143,7 @@ class Topics:
         for _, _, messages in self._messages({(key, channel.id): None}):
             for payload in messages.payloads():
                 with suppress(BagError):
-                    found.append(decoded_message(root, payload))
+                    found.append(Decoder(root).decoded(payload))
                 if len(found) == count:
                     return found
         return found
@@ -191,11 +191,12 @@ class Topics:
             for name, found in parts.items()
         }
 
-    def decoded(self, type_name: str, defaults: Mapping[str, Any]) -> list[Any]:
+    def decoded(self, type_name: str) -> list[Any]:
         """Return all messages of a type, in the order in which they were recorded.
 
         :param type_name: such as ``std_msgs/msg/Float64``.
-        :param defaults: values of the fields that an older definition lacks, by their names.
+        :return: objects with the fields as attributes, as the definition in the bag has them.
+        :raises BagError: if the definition or a message makes no sense.
         """
         wanted = {
             (number, channel.id): channel
@@ -204,7 +205,9 @@ class Topics:
         }
         found: list[tuple[int, Any]] = []
         for key, _, messages in self._messages(wanted):
-            decoded = decode_messages(wanted[key], messages.payloads(), defaults)
+            channel = wanted[key]
+            decoder = Decoder(self._type(channel), f" of {channel.topic}")
+            decoded = map(decoder.decoded, messages.payloads())
             found += zip(messages.log_time.tolist(), decoded, strict=True)
         return [message for _, message in sorted(found, key=lambda item: item[0])]
 

@@ -27,7 +27,7 @@ from made_bags import (
 )
 from mcap.writer import CompressionType, Writer
 
-from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, Definition
+from relay_autotune.bag.definitions import CYCLE, EXPERIMENT, Definition, installed_prefixes
 from relay_autotune.bag.reader import read
 from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.writer import BagWriter, Topic, encode_float64
@@ -131,6 +131,26 @@ def test_every_field_of_today_has_a_default(tmp_path, type_name):
                 names(what, defaults[name])
 
     names(type_name, DEFAULTS[type_name])
+
+
+def test_an_experiment_whose_definition_is_in_idl(tmp_path):
+    """A recorder that has the IDL files alone writes these into the bag."""
+    record = relay_record()
+    ours = ("RelayExperiment", "RelaySettings", "Reason")
+    names = [f"relay_autotune_msgs/msg/{name}" for name in ours]
+    names += ["std_msgs/msg/Header", "builtin_interfaces/msg/Time"]
+    files = [prefix / "share" / f"{n}.idl" for n in names for prefix in installed_prefixes()]
+    found = [f"{'=' * 80}\nIDL: {f.stem}\n{f.read_text()}" for f in files if f.exists()]
+    text = definition(EXPERIMENT, tmp_path).text
+    data = serialize(EXPERIMENT, text, experiment_message(record))
+    with (tmp_path / "bag.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        schema = writer.register_schema(EXPERIMENT, "ros2idl", "".join(found).encode())
+        channel = writer.register_channel("/relay_experiment", "cdr", schema)
+        writer.add_message(channel, START, bytes(data), START)
+        writer.finish()
+    assert_same_record(read_experiments(tmp_path / "bag.mcap").experiments[0], record)
 
 
 def test_a_definition_of_nonsense_is_a_sentence(tmp_path):

@@ -18,7 +18,7 @@ from relay_autotune.bag.bag_file import McapFile
 from relay_autotune.bag.signals import Selection
 from relay_autotune.bag.topics import Topics
 from relay_autotune.record.record import Outcome, Record, RelaySettings
-from relay_autotune.recordings import DEFAULTS, interrupted_experiment, read_experiments
+from relay_autotune.recordings import interrupted_experiment, read_experiments
 from relay_autotune.tuning import design
 from relay_autotune.tuning.task import DesignTask
 
@@ -55,7 +55,7 @@ def live_result(name: str, type_name: str) -> object:
     """Return the last message of a type, by the definition in the bag."""
     (path,) = (BAGS / name).glob("*.mcap")
     with McapFile(path) as file:
-        return Topics(path, [file]).decoded(type_name, DEFAULTS.get(type_name, {}))[-1]
+        return Topics(path, [file]).decoded(type_name)[-1]
 
 
 @pytest.mark.parametrize("name", SAMPLES)

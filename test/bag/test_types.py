@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from relay_autotune.bag.bag_file import McapFile
-from relay_autotune.bag.cdr import decode_messages
+from relay_autotune.bag.cdr import Decoder
 from relay_autotune.bag.definitions import (
     Channel,
     installed_prefixes,
@@ -346,10 +346,11 @@ def test_whole_messages_of_any_type(text, seed, cut):
         bytes(store.serialize_cdr(m, "x_msgs/msg/T", little_endian=bool(rng.integers(0, 2))))
         for m in messages
     ]
-    ours = decode_messages(channel("x_msgs/msg/T", text), [*data, data[0] + bytes(7)], {})
+    decoder = Decoder(message_type(channel("x_msgs/msg/T", text)), " of /t")
+    ours = map(decoder.decoded, [*data, data[0] + bytes(7)])
     assert [plain(m) for m in ours] == [plain(m) for m in (*messages, messages[0])]
     with pytest.raises(BagError, match="of /t does not fit its definition"):
-        decode_messages(channel("x_msgs/msg/T", text), [data[0][:-cut]], {})
+        decoder.decoded(data[0][:-cut])
 
 
 def test_fields_of_the_installed_definitions():
