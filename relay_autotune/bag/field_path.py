@@ -105,14 +105,18 @@ _FORMS = {
 NUMBERS = {name: Number(name, form) for name, form in _FORMS.items()}
 
 
-def numeric_paths(kind: Type, prefix: str = "", without: tuple[str, ...] = ()) -> Iterator[str]:
+# Fields that are not a quantity of a process.
+_HEADER = ("header", "stamp")
+
+
+def numeric_paths(kind: Type, prefix: str = "") -> Iterator[str]:
     """Yield the paths of a type's numbers; one element stands for those of an array.
 
-    A type of a kilobyte can hold more paths than can be listed: take only some.
+    Those of its own header are left out. A type of a kilobyte can hold more paths than can be
+    listed: take only some.
 
     :param kind: the type.
     :param prefix: the path of what is of this type.
-    :param without: names of its own fields that are left out.
     """
     if isinstance(kind, Number):
         yield prefix
@@ -120,7 +124,7 @@ def numeric_paths(kind: Type, prefix: str = "", without: tuple[str, ...] = ()) -
         yield from numeric_paths(kind.item, f"{prefix}[0]")
     elif isinstance(kind, Struct):
         for name, inner in kind.fields:
-            if name not in without and inner.has_numbers:
+            if inner.has_numbers and (prefix or name not in _HEADER):
                 yield from numeric_paths(inner, f"{prefix}.{name}" if prefix else name)
 
 
@@ -130,9 +134,6 @@ NAME_LISTS = ("name", "joint_names", "dof_names", "interface_names", "interface_
 _OWN_NAME = "name"
 
 _STEP = re.compile(r"\.?([A-Za-z]\w*)|\[(\d{1,9})\]|\[(?:([A-Za-z]\w*)=)?([^\[\]]+)\]")
-
-# Fields that are not a quantity of a process.
-_HEADER = ("header", "stamp")
 
 # Largest number of fields or names that an error lists.
 _LISTED = 12
@@ -198,7 +199,7 @@ def steps_of(root: Struct, path: str, of: str) -> tuple[Step, ...]:
         else:
             raise FieldError(f"{of} has no field {path!r}; it has {some_numbers(root)}")
     if not isinstance(kind, Number):
-        some = itertools.islice(numeric_paths(kind, without=_HEADER), _LISTED)
+        some = itertools.islice(numeric_paths(kind), _LISTED)
         inner = [_spelt(root, f"{path}{'' if p[:1] == '[' else '.'}{p}") for p in some]
         raise FieldError(
             f"{path!r} of {of} is not a number; expected the name of one"
@@ -209,16 +210,16 @@ def steps_of(root: Struct, path: str, of: str) -> tuple[Step, ...]:
 
 def some_numbers(root: Struct) -> str:
     """Return the paths of some numbers of a type, for an error."""
-    return _some_of(_listed(root)) or "no numbers"
+    return _some_of(_spelt_numbers(root)) or "no numbers"
 
 
 def first_numbers(root: Struct, count: int) -> list[str]:
     """Return the paths of the first numbers of a type, without those of its header."""
-    return list(itertools.islice(_listed(root), count))
+    return list(itertools.islice(_spelt_numbers(root), count))
 
 
-def _listed(root: Struct) -> Iterator[str]:
-    return (_spelt(root, path) for path in numeric_paths(root, without=_HEADER))
+def _spelt_numbers(root: Struct) -> Iterator[str]:
+    return (_spelt(root, path) for path in numeric_paths(root))
 
 
 def _spelt(root: Struct, path: str) -> str:

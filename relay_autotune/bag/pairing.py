@@ -308,7 +308,7 @@ def _by_name(topics: Topics, topic: str, joint: str) -> Iterator[tuple[_Candidat
     """Yield the numbers of named elements in a topic, as of a joint, and the elements' names."""
     root = topics.root_of(topic)
     messages = topics.first_messages(topic, _LOOKED_AT)
-    for path in numeric_paths(root, without=("header", "stamp")):
+    for path in numeric_paths(root):
         if "[" not in path:
             continue
         for interface in _INTERFACES:
