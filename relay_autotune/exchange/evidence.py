@@ -11,12 +11,14 @@ and gains that do not go with that frequency, are refused.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from relay_autotune.errors import ModelError, ParameterError, TuningError
+from relay_autotune.errors import IdentificationError, ModelError, ParameterError, TuningError
 from relay_autotune.experiment.early_end import FitProgress
+from relay_autotune.identification.limit_cycle.fourier import FrequencyPoint, frequency_point
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.cycles import is_switched
@@ -68,7 +70,8 @@ class ExperimentFacts:
         found = cls(record.outcome, record.duration, sign=sign)
         if not (moved > 0.0 and swing > 0.0):
             return found
-        frequency, answer, whole = *_fundamental(record), True
+        point, whole = _fundamental(record), True
+        frequency, answer = point.frequency, point.value
         if not abs(answer) > 0.0:
             changes = record.input().times
             frequency = math.pi / float(np.diff(changes)[-1]) if changes.size > 1 else math.nan
@@ -171,26 +174,16 @@ class ExperimentFacts:
             )
 
 
-def _fundamental(record: Record) -> tuple[float, complex]:
-    """Return the frequency of the oscillation, and measurement over command there; NaN: none.
+def _fundamental(record: Record) -> FrequencyPoint:
+    """Return the process at the frequency of the oscillation; NaN: the record has none.
 
-    The first half of the cycles may still be settling. Sums of rectangles are accurate enough
-    here, and need no method to be loaded.
+    The first half of the cycles may still be settling.
     """
-    starts = record.cycle_start[len(record.cycle_start) // 2 - 1 :]
-    if len(record.cycle_start) < 2 or not record.time[starts[-1]] > record.time[starts[0]]:
-        return math.nan, complex(math.nan)
-    part = slice(starts[0], starts[-1])
-    time = record.time[starts[0] : starts[-1] + 1]
-    frequency = 2.0 * math.pi * (len(starts) - 1) / float(time[-1] - time[0])
-    weight = np.diff(time) * np.exp(-1j * frequency * (time[:-1] - time[0]))
-    turns = weight.sum()
-    length = float(time[-1] - time[0])
-    y, u = (
-        complex((column[part] * weight).sum() - column[part] @ np.diff(time) / length * turns)
-        for column in (record.measurement, record.command)
-    )
-    return frequency, y / u if u != 0.0 else complex(math.nan)
+    ends = record.time[list(record.cycle_start[len(record.cycle_start) // 2 - 1 :])]
+    if ends.size > 1 and ends[-1] > ends[0]:
+        with suppress(IdentificationError):
+            return frequency_point(record, ends)
+    return FrequencyPoint(math.nan, complex(math.nan))
 
 
 def check_finding(
