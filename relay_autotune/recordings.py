@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -26,6 +27,7 @@ from relay_autotune.bag.signals import Selection, Signal
 from relay_autotune.bag.topics import Progress, Topics
 from relay_autotune.errors import BagError, RecordError, SelectionError
 from relay_autotune.exchange.messages import (
+    record_from_cycles,
     record_from_message,
     settings_from_message,
     stamp_nanoseconds,
@@ -403,22 +405,18 @@ def _rebuilt(topics: Topics, about: Mapping[str, str]) -> Record:
 def _cycle_start(cycles: Sequence[Any], taken: IntArray) -> tuple[int, ...]:
     """Return the samples that bound the cycles.
 
-    :param cycles: their messages, in order and without a gap.
+    :param cycles: their messages, in order and without a gap; those of older versions may lack
+        the samples.
     :param taken: time of each sample [ns], shape (n,).
     """
-    bounds: list[int] = []
-    for cycle in cycles:
-        stamp = stamp_nanoseconds(cycle.header.stamp)
-        lead_in = min(int(cycle.lead_in), max(len(cycle.time) - 1, 0))
-        bounds += [stamp + round(float(t) * 1e9) for t in cycle.time[lead_in:][:1]]
-    bounds += [
-        stamp_nanoseconds(cycle.header.stamp) + round(float(cycle.time[-1]) * 1e9)
-        for cycle in cycles[-1:]
-        if len(cycle.time)
-    ]
-    # The stamps went through seconds in double precision.
-    near = np.searchsorted(taken, np.array(bounds, dtype=np.int64) - _STAMP_ERROR_NS)
-    return tuple(sorted({int(i) for i in near if i < taken.size}))
+    with suppress(RecordError):
+        joined = record_from_cycles(cycles)
+        origin = stamp_nanoseconds(cycles[0].header.stamp)
+        bounds = np.round(1e9 * joined.time[list(joined.cycle_start)]).astype(np.int64)
+        # The stamps went through seconds in double precision.
+        near = np.searchsorted(taken, origin + bounds - _STAMP_ERROR_NS)
+        return tuple(sorted({int(i) for i in near if i < taken.size}))
+    return ()
 
 
 def preceded(command: Signal, before: float | None) -> Signal:
