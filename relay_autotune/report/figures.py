@@ -127,15 +127,13 @@ def _samples(axes: Axes, record: Record) -> None:
 
 def _shade_cycles(axes: Axes, case: Case) -> None:
     averaged = case.limit_cycle.cycles if case.limit_cycle is not None else ()
-    named = False
     for cycle in case.cycles:
         end = cycle.start + cycle.period
         if cycle.disturbed:
             axes.axvspan(
                 cycle.start, end, facecolor="none", edgecolor=PURPLE, hatch="///", lw=0.0,
-                alpha=0.6, label=None if named else "disturbed cycle",
+                alpha=0.6, label="disturbed cycle",
             )  # fmt: skip
-            named = True
         if len(case.cycles) <= _NUMBERED:
             axes.axvline(cycle.start, color=GRID, lw=1.2, zorder=0.5)
             axes.axvline(end, color=GRID, lw=1.2, zorder=0.5)

@@ -111,7 +111,7 @@ def put_units(figure: Figure, units: Mapping[str, str]) -> None:
 def legend(figure: Figure | SubFigure, *, columns: int) -> None:
     """Put one legend above all axes of a figure, where it hides nothing.
 
-    :param figure: whose axes have labelled artists.
+    :param figure: whose axes have labelled artists; those of one label are one entry.
     :param columns: entries a row.
     """
     handles: list[Artist] = []
