@@ -120,14 +120,13 @@ def read_columns(path: Path, columns: Sequence[str] | None = None) -> dict[str, 
     :raises BagError: if the file cannot be read, or holds anything but numbers.
     """
     with _table(path) as table:
-        time, _ = _time(path, table, Selection(), ())
+        time = _time(table, Selection(), ())
         assert time is not None
         names = table.names if columns is None else columns
-        places = [_named(path, table.names, name) for name in names]
+        places = [_named(table, name) for name in names]
         places = [at for at in places if columns is not None or at != time]
         times, values = table.columns(time, places)
-    name = table.names[time]
-    time_ns, _ = _nanoseconds(path, name, times, table.units.get(name), [])
+    time_ns, _ = _nanoseconds(table, time, times)
     order = np.argsort(time_ns, kind="stable")
     found = {}
     for at, column in zip(places, values, strict=True):
@@ -150,10 +149,9 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
     :raises BagError: if the file cannot be read, or holds anything but numbers.
     """
     with _table(path) as table:
-        time, pair, said = _choose(path, table, wanted)
+        time, pair = _choose(table, wanted)
         times, columns = table.columns(time, pair)
-    values, lines = np.array(columns), table.lines
-    notes = [*table.notes, *said]
+    values, lines, notes = np.array(columns), table.lines, table.notes
     names = [table.names[at] for at in pair]
     if wanted.measurement is None and wanted.command is None:
         swapped, why = _order(path, names, *values)
@@ -170,8 +168,7 @@ def read_csv(path: Path, wanted: Selection) -> tuple[Log, ...]:
     else:
         assert time is not None
         name = table.names[time]
-        unit = wanted.time_unit or table.units.get(name)
-        time_ns, dated = _nanoseconds(path, name, times, unit, notes)
+        time_ns, dated = _nanoseconds(table, time, times, wanted.time_unit)
         unset = time_ns < EPOCH * 1e9
         if dated and 0 < np.count_nonzero(unset) <= _UNSET * unset.size:
             notes.append(
@@ -306,9 +303,17 @@ def _spread(time_ns: IntArray) -> tuple[IntArray, float]:
 
 
 def _nanoseconds(
-    path: Path, name: str, times: Times, given: str | None, notes: list[str]
+    table: TextTable, at: int, times: Times, time_unit: str | None = None
 ) -> tuple[IntArray, bool]:
-    """Return times in nanoseconds, and whether they are dates."""
+    """Return times in nanoseconds, and whether they are dates.
+
+    :param table: takes what is to be known of them as notes.
+    :param at: place of their column.
+    :param times: as they stand.
+    :param time_unit: their unit; None: as the table says.
+    """
+    path, name, notes = table.path, table.names[at], table.notes
+    given = time_unit or table.units.get(name)
     if times.dates:
         if max(map(abs, times.dates)) >= 2**63:
             raise BagError(
@@ -430,20 +435,20 @@ def _recordings(time_ns: IntArray) -> list[int]:
     return [*bounds, time_ns.size]
 
 
-def _choose(
-    path: Path, table: TextTable, wanted: Selection
-) -> tuple[int | None, list[int], list[str]]:
-    """Return the places of the time, None without one, and of measurement and command, and notes.
+def _choose(table: TextTable, wanted: Selection) -> tuple[int | None, list[int]]:
+    """Return the places of the time, None without one, and of measurement and command.
 
+    :param table: takes how they were found as notes.
+    :param wanted: the columns, as far as they are named.
     :raises SelectionError: if neither flags nor names tell which they are.
     """
     names, given = table.names, (wanted.measurement, wanted.command)
-    pair = [_named(path, names, name) for name in given if name is not None]
-    time, notes = _time(path, table, wanted, pair)
+    pair = [_named(table, name) for name in given if name is not None]
+    time = _time(table, wanted, pair)
     rest = [k for k in range(len(names)) if k != time]
     if not pair and len(rest) == 2:
         pair = rest
-    notes += doubts_about(*given)
+    table.notes += doubts_about(*given)
     choices, still, sure = [], [], False
     if len(pair) < 2:
         moving = {names[k] for k in table.looks[0]}
@@ -458,10 +463,10 @@ def _choose(
         ((y, u, named),) = choices
         pair = [names.index(y), names.index(u)]
         why = "as their names say" if named else "since no other pair is possible"
-        notes += [
+        table.notes.append(
             f"of {len(names)} columns {y!r} is taken as the measurement and {u!r} as the command, "
             f"{why}; --measurement and --command name others"
-        ]
+        )
     if len(pair) < 2:
         least = (
             "; expected time, measurement and command in each row (put blocks of single signals "
@@ -476,25 +481,25 @@ def _choose(
             least += f" (constant, empty or text: {listed(still)})" * bool(still)
             least += ", such as" * bool(choices)
         raise SelectionError(
-            f"{path} has {len(names)} columns: {listed(names)}{least}",
+            f"{table.path} has {len(names)} columns: {listed(names)}{least}",
             [(flags_of(y, u), "as their names say" * named) for y, u, named in choices],
         )
     for at in pair:
-        _named(path, names, names[at])
+        _named(table, names[at])
     if len({time, *pair}) < 3:
         chosen = [names[at] for at in (time, *pair) if at is not None]
         raise SelectionError(
-            f"time, measurement and command must be three columns of {path}, "
+            f"time, measurement and command must be three columns of {table.path}, "
             f"found {listed(chosen)}"
         )
-    return time, pair, notes
+    return time, pair
 
 
-def _time(
-    path: Path, table: TextTable, wanted: Selection, taken: Sequence[int]
-) -> tuple[int | None, list[str]]:
-    """Return the place of the time, and notes; None: rows come one period after another.
+def _time(table: TextTable, wanted: Selection, taken: Sequence[int]) -> int | None:
+    """Return the place of the time; None: rows come one period after another.
 
+    :param table: takes how it was found as a note.
+    :param wanted: the column, if it is named.
     :param taken: places of columns that are named as something else.
     :raises SelectionError: if no column is named as a time, or is the first or only one to rise.
     """
@@ -508,25 +513,27 @@ def _time(
             raise SelectionError(
                 f"--period {wanted.period:g} is no time from row to row; expected > 0"
             )
-        return None, []
+        return None
     if wanted.time is not None:
-        return _named(path, names, wanted.time), []
+        return _named(table, wanted.time)
     # The first column, unless only another one is called so.
     called_so = [k for k, name in enumerate(names) if k not in taken and is_time(name)]
     if is_time(names[0]) or len(names) < 3:
-        return 0, []
+        return 0
     if called_so:
-        return called_so[0], [f"the time is taken from the column {names[called_so[0]]!r}"]
+        table.notes.append(f"the time is taken from the column {names[called_so[0]]!r}")
+        return called_so[0]
     rising = [k for k in table.looks[1] if k not in taken and role_of(names[k]) is None]
     if rising[:1] == [0]:
-        return 0, []
+        return 0
     if len(rising) == 1:
         name = names[rising[0]]
-        return rising[0], [f"the time is taken from the column {name!r}, which alone rises"]
+        table.notes.append(f"the time is taken from the column {name!r}, which alone rises")
+        return rising[0]
     others = f" as {listed([names[k] for k in rising])} do" * bool(rising)
     raise SelectionError(
-        f"{path}: the column {names[0]!r} does not rise from row to row{others}, so it is no "
-        "time; name that with --time NAME, or, if there is none, give the sampling period with "
+        f"{table.path}: the column {names[0]!r} does not rise from row to row{others}, so it is "
+        "no time; name that with --time NAME, or, if there is none, give the sampling period with "
         "--period S"
     )
 
@@ -600,8 +607,9 @@ def _steps(values: FloatArray) -> bool:
     )
 
 
-def _named(path: Path, names: Sequence[str], wanted: str) -> int:
+def _named(table: TextTable, wanted: str) -> int:
     """Return the place of a column by its name, perhaps without the unit, or by its number."""
+    path, names = table.path, table.names
     numbers = [str(k + 1) for k in range(len(names))]
     ways = (names, map(without_unit, names), numbers)
     every = ([k for k, name in enumerate(way) if name == wanted] for way in ways)

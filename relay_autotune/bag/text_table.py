@@ -90,7 +90,7 @@ class TextTable:
     """
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
-        self._path = path
+        self.path = path
         self.notes: list[str] = []
         self.lines: IntArray = np.empty(0, dtype=np.int64)
         size = file.seek(0, io.SEEK_END)
@@ -138,8 +138,8 @@ class TextTable:
 
         The file is read once more for it. A column that rises may begin anew at a few rows.
         """
-        with open_regular(self._path) as file:
-            return TextTable(self._path, file)._looks()
+        with open_regular(self.path) as file:
+            return TextTable(self.path, file)._looks()
 
     def _looks(self) -> tuple[list[int], list[int]]:
         columns = range(len(self.names))
@@ -188,7 +188,7 @@ class TextTable:
         else:
             data = next((k for k, (_, cells) in enumerate(rows) if _is_data(cells)), len(rows))
         if not rows:
-            raise BagError(f"{self._path} is empty; expected a header line, then rows of numbers")
+            raise BagError(f"{self.path} is empty; expected a header line, then rows of numbers")
         self._waiting = rows[data:]
         width = len(self._waiting[0][1]) if self._waiting else 0
         # A separator at the end of each line makes no column.
@@ -204,7 +204,7 @@ class TextTable:
                 line, cells = rows[-1]
                 found = visible(self._separator.join(cells))
                 raise BagError(
-                    f"{self._path} has 0 rows of numbers; line {line} is {found[:_SHOWN]!r}; "
+                    f"{self.path} has 0 rows of numbers; line {line} is {found[:_SHOWN]!r}; "
                     "expected columns of time, measurement and command, separated by commas, "
                     "semicolons, tabs or spaces: write the numbers of such lines into columns"
                 )
@@ -218,7 +218,7 @@ class TextTable:
                 )
                 if self._separator == "," and width in (2 * count - 1, 2 * count):
                     # Each number stands in two cells, unless the time has no decimals.
-                    raise BagError(f"{self._path}: {why}{_COMMAS}")
+                    raise BagError(f"{self.path}: {why}{_COMMAS}")
             self.notes.append(f"{why}; the columns are called {listed(names)}")
             return names
         line, cells = above[-1]
@@ -326,17 +326,17 @@ class TextTable:
             raise next(iter(faults.values()))
         self._settle_order(times)
         if len(lines) < 2:
-            raise BagError(f"{self._path} has fewer than two rows of numbers; expected more")
+            raise BagError(f"{self.path} has fewer than two rows of numbers; expected more")
         for count, what in ((len(times.dates), "dates"), (len(times.clock), "times of day")):
             if time is not None and 0 < count < len(lines):
                 raise BagError(
-                    f"{self._path}: of {len(lines)} cells of {self.names[time]!r} {count} are "
+                    f"{self.path}: of {len(lines)} cells of {self.names[time]!r} {count} are "
                     f"{what}, the others not; expected one of them"
                 )
         if self._comma and self._point:
             comma, point = (f"{c!r} in line {n}" for n, c in (self._comma, self._point))
             raise BagError(
-                f"{self._path} has numbers with a decimal comma and others with a point, such as "
+                f"{self.path} has numbers with a decimal comma and others with a point, such as "
                 f"{comma} and {point}; expected one of them"
             )
         if self._comma:
@@ -344,7 +344,7 @@ class TextTable:
         if untimed:
             self.notes.append(f"{untimed} rows without a time are left out")
         for fault, earliest in faults.items():
-            first = str(earliest).removeprefix(f"{self._path}, ")
+            first = str(earliest).removeprefix(f"{self.path}, ")
             self.notes.append(f"{counts[fault]} rows {fault} and are left out, the first: {first}")
         self.lines = np.array(lines, dtype=np.int64)
         return times, [np.array(column) for column in values]
@@ -352,7 +352,7 @@ class TextTable:
     def _uneven(self, line: int, count: int) -> BagError:
         hint = "; a decimal comma, or a separator within a text, would make such a line"
         return BagError(
-            f"{self._path}, line {line}: {count} cells, but {len(self.names)} columns have a name"
+            f"{self.path}, line {line}: {count} cells, but {len(self.names)} columns have a name"
             + hint * (count > len(self.names))
         )
 
@@ -382,7 +382,7 @@ class TextTable:
         """Read dates that could be read in two ways as the others of their column are."""
         if len(times.day_first) > 1:
             raise BagError(
-                f"{self._path} has dates with the day first and others with the month first; "
+                f"{self.path} has dates with the day first and others with the month first; "
                 "expected one of them"
             )
         if times.day_first == {True}:
@@ -424,7 +424,7 @@ class TextTable:
         between = self._separator == "," and "," in cell and _is_number(cell.replace(",", ""))
         hint = _COMMAS if between else _GROUPED * bool(_GROUPS.fullmatch(cell))
         return BagError(
-            f"{self._path}, line {line}: {self.names[at]!r} is {shown}; expected a "
+            f"{self.path}, line {line}: {self.names[at]!r} is {shown}; expected a "
             f"{'finite ' if finite else ''}number{hint}"
         )
 
