@@ -33,15 +33,14 @@ from relay_autotune.bag.limits import (
     LARGEST_DEFINITION,
     MOST_DECLARATIONS,
     MOST_DECLARED,
-    MOST_NOTES,
     MOST_SOUGHT,
     MOST_STEPS_OF_SQLITE,
     STEPS_OF_SQLITE_PER_BYTE,
 )
 from relay_autotune.bag.mcap_layout import (
     Segment,
-    damage_note,
     layout_by_summary,
+    note_damage,
     record_at,
     scan,
     segment_content,
@@ -101,13 +100,6 @@ class BagFile(Source):
         """
         raise NotImplementedError
 
-    def _note(self, note: str) -> None:
-        if note in self.notes or len(self.notes) > MOST_NOTES:
-            return
-        if len(self.notes) == MOST_NOTES:
-            note = f"{self.path.name} has more faults, which are not listed"
-        self.notes.append(note)
-
     def _as_sent(self, channel: int, messages: Messages, of: str = "") -> Iterator[Messages]:
         """Yield messages as they were before they were compressed one by one, some at a time.
 
@@ -144,7 +136,7 @@ class BagFile(Source):
             yield _together(messages, kept, parts)
         if refusal and channel not in self._refused:
             self._refused.add(channel)
-            self._note(
+            self.note(
                 f"{self.path.name} has compressed messages{of} that cannot be expanded, the "
                 f"first of them because {refusal}; they are left out"
             )
@@ -212,7 +204,6 @@ class McapFile(BagFile):
         self.channels = layout.declared.channels
         self.metadata = layout.declared.metadata
         self.message_counts = layout.declared.message_counts or {}
-        self.notes += layout.notes
 
     def segments(self, channels: Collection[int]) -> list[Segment]:
         """Return the segments that may hold messages of some channels, in the order of the file.
@@ -229,12 +220,10 @@ class McapFile(BagFile):
         if all(record_at(self, s.start, s.end) == (Opcode.CHUNK, s.end) for s in chosen):
             return chosen
         self._layout = scan(self)
-        for note in self._layout.notes:
-            self._note(note)
         found = self._layout.declared.channels
         for channel in wanted:
             if found.get(channel) != self.channels.get(channel):
-                self._note(
+                self.note(
                     f"{self.path.name} declares {self._name(channel)} at its end otherwise than "
                     f"among its data; its end counts"
                 )
@@ -265,12 +254,12 @@ class McapFile(BagFile):
         """Note where the file has more or fewer messages of a channel than its statistics say."""
         declared = self._layout.declared.message_counts
         for contradiction in self._layout.declared.contradictions:
-            self._note(f"{self.path.name} contradicts itself: {contradiction}; the first counts")
+            self.note(f"{self.path.name} contradicts itself: {contradiction}; the first counts")
         if declared is None:
             return
         for channel, count in counts.items():
             if count != declared.get(channel, 0) and channel in self.channels:
-                self._note(
+                self.note(
                     f"{self.path.name} says that it has {declared.get(channel, 0)} messages of "
                     f"{self._name(channel)}; it has {count}"
                 )
@@ -283,7 +272,7 @@ class McapFile(BagFile):
             try:
                 content = segment_content(self, segment)
             except DamageError as damage:
-                self._note(damage_note(self, segment, damage))
+                note_damage(self, segment, damage)
                 continue
             if batch and size + len(content) > _BATCH:
                 yield batch
@@ -317,7 +306,7 @@ class McapFile(BagFile):
                 return [found for piece in pieces for found in self._messages([piece], wanted)]
             if end != len(content) and pieces[0].segment.whole:
                 damage = DamageError(f"a record of impossible length at {end}")
-                self._note(damage_note(self, pieces[0].segment, damage))
+                note_damage(self, pieces[0].segment, damage)
             found = sorted_records(content, offsets, wanted, self.channels)
             self._check(content, found)
             for piece, begin, stop in zip(pieces, begins[:-1], begins[1:], strict=True):
@@ -330,16 +319,16 @@ class McapFile(BagFile):
         try:
             self._layout.declared.take_all(content, found.others)
         except DamageError as damage:
-            self._note(f"{name} holds a declaration that makes no sense: {damage}")
+            self.note(f"{name} holds a declaration that makes no sense: {damage}")
         if found.unknown.size:
             at = int(found.unknown[0]) + RECORD.size
             channel = int.from_bytes(content[at : at + 2], "little")
-            self._note(
+            self.note(
                 f"{name} holds messages of channels that it does not declare, such as {channel}; "
                 f"they are left out"
             )
         if found.short:
-            self._note(f"{name} holds messages shorter than their own head; they are left out")
+            self.note(f"{name} holds messages shorter than their own head; they are left out")
 
     def _check_index(
         self, piece: _Piece, found: Sorted, wanted: frozenset[int], begin: int, stop: int
@@ -354,7 +343,7 @@ class McapFile(BagFile):
             listed = piece.listed.get(channel, NOWHERE) + begin
             if np.array_equal(there, listed) or np.array_equal(there, np.sort(listed)):
                 continue
-            self._note(
+            self.note(
                 f"{self.path.name} has a bad message index at byte {piece.segment.end}: of "
                 f"{there.size} messages of {self._name(channel)} it lists "
                 f"{np.isin(there, listed).sum()}, and {np.count_nonzero(~np.isin(listed, there))} "
@@ -528,7 +517,7 @@ class SqliteFile(BagFile):
                     yield from self._runs(rows, before)
                     before, size, rows = before + len(rows), 0, []
         except (sqlite3.Error, MemoryError) as error:
-            self._note(f"{self.path.name} cannot be read to its end ({error})")
+            self.note(f"{self.path.name} cannot be read to its end ({error})")
         yield from self._runs(rows, before)
 
     def _runs(

@@ -103,14 +103,12 @@ class Layout:
     """What a file holds, and where.
 
     :param declared: channels and metadata.
-    :param notes: faults of the file, each a sentence.
     :param segments: in the order of the file, where it was gone through.
     :param index: the index at its end, whose places are not checked yet; None: it was gone
         through.
     """
 
     declared: Declarations = field(default_factory=Declarations)
-    notes: list[str] = field(default_factory=list)
     segments: list[Segment] = field(default_factory=list)
     index: ChunkIndex | None = None
 
@@ -161,9 +159,9 @@ def segment_content(source: Source, segment: Segment) -> Content:
     return content
 
 
-def damage_note(source: Source, segment: Segment, damage: DamageError) -> str:
-    """Return the note on a segment that cannot be used."""
-    return (
+def note_damage(source: Source, segment: Segment, damage: DamageError) -> None:
+    """Note that a segment cannot be used."""
+    source.note(
         f"{source.path.name} is damaged at byte {segment.start}: {damage}; "
         f"what lay there is left out"
     )
@@ -245,7 +243,8 @@ class _Scan:
         if self.times:
             seconds = (max(self.times) - min(self.times)) / 1e9
             until = f" until {seconds:.3f} s after the first"
-        self.layout.notes.append(
+        # It is told however many other faults there are.
+        self.source.notes.append(
             f"unfinished recording: {self.source.path.name} ends without its footer; "
             f"it holds {self.count} messages{until}"
         )
@@ -276,7 +275,7 @@ class _Scan:
                 self.times += [int(times.min()), int(times.max())]
         except DamageError as damage:
             if segment.whole:
-                self.layout.notes.append(damage_note(self.source, segment, damage))
+                note_damage(self.source, segment, damage)
         self.layout.segments.append(replace(segment, channels=channels))
         return segment.end
 

@@ -21,6 +21,7 @@ from relay_autotune.bag.limits import (
     LARGEST_WINDOW,
     MOST_EXPANSION,
     MOST_MESSAGES,
+    MOST_NOTES,
     UNSUSPICIOUS,
 )
 from relay_autotune.errors import BagError, os_errors_as, system_says
@@ -168,6 +169,14 @@ class Source:
                 f"{self.path} holds more than {most} messages in {self.size} bytes; expected a "
                 f"recording"
             )
+
+    def note(self, fault: str) -> None:
+        """Note a fault of the file, each once, and a limited number of them."""
+        if fault in self.notes or len(self.notes) > MOST_NOTES:
+            return
+        if len(self.notes) == MOST_NOTES:
+            fault = f"{self.path.name} has more faults, which are not listed"
+        self.notes.append(fault)
 
     def announce(self, ranges: Iterable[tuple[int, int]]) -> None:
         """Tell the system what will be read, so that a disk fetches it all at once.

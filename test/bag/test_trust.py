@@ -304,6 +304,21 @@ def test_a_checksum_that_is_wrong_costs_its_chunk_alone(tmp_path):
     assert "the checksum of a chunk is wrong" in notes[0]
 
 
+def test_the_faults_of_a_file_that_was_cut_are_not_all_listed(tmp_path, monkeypatch):
+    monkeypatch.setattr(source, "MOST_NOTES", 3)
+    path = write(tmp_path / "bag.mcap", other=1)
+    data = bytearray(path.read_bytes())
+    _, *damaged = chunks(data)
+    assert len(damaged) > 5
+    for at in damaged:
+        data[at + 100] ^= 1
+    path.write_bytes(data[:-20])
+    _, notes = read(path)
+    assert len(notes) == 5
+    assert "has more faults, which are not listed" in notes[-2]
+    assert "unfinished recording" in notes[-1]
+
+
 def test_times_beyond_every_clock(tmp_path):
     times = [2**64 - 1 - k for k in range(COUNT)]
     values, _ = read(write(tmp_path / "bag.mcap", times=times))
