@@ -54,7 +54,6 @@ class _Cluster:
 
     :param nodes: the poles, real ones as real numbers.
     :param centre: their mean.
-    :param place: of their states among all.
     :param share: 2 for the upper poles of conjugate pairs, of which the outputs take twice the
         real part; else 1.
     :param terms: ``(A - c)^p / (p! scale^p)``, shape (terms, n, n); None: the poles are equal.
@@ -64,7 +63,6 @@ class _Cluster:
 
     nodes: tuple[Any, ...]
     centre: Any
-    place: slice
     share: float
     terms: Coordinates | None
     scale: float
@@ -217,8 +215,8 @@ def _of_ratios(
 class Modes:
     """Transfer functions of one denominator, without dead time, by the states of its poles.
 
-    The states describe process and held input together; they change by :attr:`input_direction`
-    times the step where the input steps. They belong to clusters, each with an array of its own.
+    The states describe process and held input together. They belong to clusters, each with an
+    array of its own: shape (n,), or (n, ..., m) of many at once.
 
     :param constants: time constants T of the poles, ``prod(1 + T s)``, pairs complete [s].
     :param integrators: further poles at s = 0.
@@ -254,10 +252,9 @@ class Modes:
         self._clusters: list[_Cluster] = []
         first = 0
         for group, paired in zip(groups, upper, strict=True):
-            place = slice(first, first + len(group))
-            first = place.stop
             nodes: tuple[Any, ...] = tuple(group)
-            rows: Coordinates = every_row[:, place]
+            rows: Coordinates = every_row[:, first : first + len(group)]
+            first += len(group)
             terms, scale = None, 1.0
             if not any(e.imag for e in group):
                 nodes, rows = tuple(e.real for e in group), rows.real
@@ -267,11 +264,8 @@ class Modes:
                 scale = abs(centre) or 1.0
                 terms = _terms(nodes, centre, scale, _term_count(nodes, centre, horizon))
             share = 2.0 if paired else 1.0
-            self._clusters.append(_Cluster(nodes, centre, place, share, terms, scale, rows))
+            self._clusters.append(_Cluster(nodes, centre, share, terms, scale, rows))
         self._shares = np.concatenate([c.shares for c in self._clusters], axis=1)
-        self.size = first
-        self.input_direction = np.zeros(first)
-        self.input_direction[[c.place.stop - 1 for c in self._clusters]] = 1.0
 
     @classmethod
     def of(cls, model: TransferFunction, horizon: float = math.inf) -> Modes:
@@ -297,42 +291,40 @@ class Modes:
         found._shares = np.concatenate([c.shares for c in found._clusters], axis=1)
         return found
 
-    def rest(self) -> Coordinates:
-        """Return the states of the process at rest with zero input, shape (size,)."""
-        return np.zeros(self.size, dtype=np.complex128)
+    def rest(self) -> list[Coordinates]:
+        """Return the states of the process at rest with zero input."""
+        return [np.zeros(len(c.nodes), dtype=c.rows.dtype) for c in self._clusters]
 
-    def split(self, z: Coordinates) -> list[Coordinates]:
-        """Return states by cluster, as :meth:`outputs` takes them.
+    def stepped(self, states: Sequence[Coordinates], step: float) -> list[Coordinates]:
+        """Return the states just after a step of the input.
 
-        :param z: shape (size,).
+        :param states: just before it.
+        :param step: its height [u].
         """
-        return [
-            (z[c.place] if np.iscomplexobj(c.rows) else z[c.place].real)[:, None]
-            for c in self._clusters
-        ]
+        return [np.append(own[:-1], own[-1] + step) for own in states]
+
+    def moved(self, states: Sequence[Coordinates], time: float) -> list[Coordinates]:
+        """Return the states some time later, with the input held.
+
+        :param states: now.
+        :param time: s, of either sign.
+        """
+        parts = zip(self._clusters, states, strict=True)
+        return [np.asarray(cluster.matrix(time) @ own) for cluster, own in parts]
+
+    def mirrored(self, states: Sequence[Coordinates], time: float) -> list[Coordinates]:
+        """Return the states that are, with what becomes of them in a time, the given ones.
+
+        :param states: their sum.
+        :param time: s.
+        """
+        parts = zip(self._clusters, states, strict=True)
+        return [np.linalg.solve(c.matrix(time) + np.eye(own.size), own) for c, own in parts]
 
     def size_of(self, states: Sequence[Coordinates]) -> float:
         """Return the sum of the magnitudes of which the first output is the sum."""
         parts = zip(self._clusters, states, strict=True)
-        return sum(c.share * float(np.abs(c.rows[0]) @ np.abs(own[:, 0])) for c, own in parts)
-
-    def propagator(self, time: float) -> Coordinates:
-        """Return the matrix that moves the states on by a time.
-
-        :param time: s, of either sign.
-        :return: block diagonal, shape (size, size).
-        """
-        moved = np.zeros((self.size, self.size), dtype=np.complex128)
-        for cluster in self._clusters:
-            moved[cluster.place, cluster.place] = cluster.matrix(time)
-        return moved
-
-    def move(self, z: Coordinates, time: float) -> Coordinates:
-        """Return the states ``time`` [s] later, with the input held.
-
-        :param z: states, shape (size,).
-        """
-        return np.asarray(self.propagator(time) @ z)
+        return sum(c.share * float(np.abs(c.rows[0]) @ np.abs(own)) for c, own in parts)
 
     def states(
         self, changes: FloatArray, steps: FloatArray, *, backward: bool = False
@@ -357,15 +349,15 @@ class Modes:
     ) -> FloatArray:
         """Return the outputs some time after given states.
 
-        :param states: of each cluster, shapes (n, ..., m).
+        :param states: of each cluster, shapes (n, ..., m), or (n,) of one only.
         :param time: since these states [s], shape (k,).
-        :param segment: which of the states, shape (k,); None: the first one.
+        :param segment: which of the states, shape (k,); None: there is one only.
         :return: shape (p, ..., k).
         """
         motions: list[FloatArray] = []
         for cluster, own in zip(self._clusters, states, strict=True):
             moved = cluster.motions(time)
-            at = [row[..., :1] if segment is None else row.take(segment, axis=-1) for row in own]
+            at = own if segment is None else own.take(segment, axis=-1)
             for k in range(len(at)):
                 now = moved[k][k] * at[k]
                 for m in range(k + 1, len(at)):

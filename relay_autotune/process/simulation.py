@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,15 +55,12 @@ class HalfCycle:
         self._poles = [-1.0 / t for t in model.time_constants] + [0j] * model.integrators
         horizon = max(len(self._poles), 2) * half_period
         self._modes = modes = Modes.of(model, horizon)
-        kick = 2.0 * amplitude * model.process_sign * modes.input_direction
-        whole, early, late = (
-            modes.propagator(t)
-            for t in (half_period, model.dead_time, half_period - model.dead_time)
-        )
-        before = np.linalg.solve(whole + np.eye(modes.size), late @ kick)
-        after = early @ before - kick
-        self._states = modes.split(before), modes.split(after)
-        self._later = modes.split(late @ after)
+        kick, late = 2.0 * amplitude * model.process_sign, half_period - model.dead_time
+        kicked = modes.moved(modes.stepped(modes.rest(), kick), late)
+        before = modes.mirrored(kicked, half_period)
+        after = modes.stepped(modes.moved(before, model.dead_time), -kick)
+        self._states = before, after
+        self._later = modes.moved(after, late)
         self._rates = modes.rates
 
     def __call__(self, time: FloatArray) -> FloatArray:
@@ -149,7 +146,7 @@ class _Piece:
 
     :param modes: of the process.
     :param rates: the same, of the rate of its output.
-    :param z: their states at the beginning.
+    :param states: their states at the beginning.
     :param level: measurement at rest [y].
     :param corners: the shortest time constant [s], and the fastest oscillation [rad/s].
     :param begin: when it begins [s].
@@ -159,17 +156,16 @@ class _Piece:
         self,
         modes: Modes,
         rates: Modes,
-        z: Coordinates,
+        states: Sequence[Coordinates],
         level: float,
         corners: tuple[float, float],
         begin: float,
     ) -> None:
         self.begin, self.length = begin, 0.0
-        self._modes, self._rates, self._states = modes, rates, modes.split(z)
+        self._modes, self._rates, self._states = modes, rates, states
         self._level, self._corners = level, corners
         # A smaller difference from a threshold is rounding.
-        size = modes.size_of(self._states)
-        self._rounding = 8.0 * np.finfo(float).eps * (abs(level) + size)
+        self._rounding = 8.0 * np.finfo(float).eps * (abs(level) + modes.size_of(states))
 
     def output(self, time: ArrayLike) -> FloatArray:
         at = np.atleast_1d(np.asarray(time, dtype=np.float64))
@@ -193,17 +189,17 @@ class _Piece:
         cells = np.flatnonzero(slope[:-1] * slope[1:] < 0.0)
         return np.unique(np.append(grid, [_at_zero(self._slope, grid, i) for i in cells.tolist()]))
 
-    def first_rise(self, excess: Callable[[FloatArray], FloatArray], length: float) -> float:
-        """First time at which ``excess(y)`` passes zero upwards; nan if it does not."""
+    def first_crossing(self, threshold: float, side: int, length: float) -> float:
+        """First time at which the output passes a threshold, up (1) or down (-1); nan: never."""
         at = self.instants(length)
-        f = excess(self.output(at))
+        f = side * (self.output(at) - threshold)
         cells = np.flatnonzero((f[:-1] <= self._rounding) & (f[1:] > self._rounding))
         if cells.size == 0:
             return math.nan
         i = int(cells[0])
         if f[i] >= -self._rounding:
             return float(at[i])
-        return _at_zero(lambda time: float(excess(self.output(time))[0]), at, i)
+        return _at_zero(lambda time: float(self.output(time)[0]) - threshold, at, i)
 
 
 def simulate_relay(
@@ -239,30 +235,24 @@ def simulate_relay(
     corners = (min(constants), oscillation)
     level = settings.setpoint if operating_point is None else operating_point
 
-    z, now, arrived = modes.rest(), 0.0, settings.baseline
+    states, now = modes.rest(), 0.0
     # The first level moves the measurement up, to its first threshold.
-    rising, is_high = True, not settings.reverse_acting
-    threshold = settings.setpoint + (settings.hysteresis if kick is None else kick)
+    side, threshold = 1, settings.setpoint + (settings.hysteresis if kick is None else kick)
     if threshold == level and dead_time == 0.0:
         # Which way the first switch goes would be rounding.
         raise _no_delay(0.0)
-    switches = [(0.0, settings.high if is_high else settings.low)]
-    on_the_way = deque([(dead_time, switches[0][1])])
+    switches = [(0.0, settings.low if settings.reverse_acting else settings.high)]
+    # When the process sees the command change, and by how much.
+    on_the_way = deque([(dead_time, switches[0][1] - settings.baseline)])
     pieces: list[_Piece] = []
     # The half cycle from rest and the one after it come before the first whole cycle.
     while len(switches) < 2 * cycles + 3:
         while on_the_way and on_the_way[0][0] <= now:
-            _, value = on_the_way.popleft()
-            z = z + (value - arrived) * modes.input_direction
-            arrived = value
+            states = modes.stepped(states, on_the_way.popleft()[1])
         slowest = max(*constants, dead_time, 1e-12)
         length = on_the_way[0][0] - now if on_the_way else 60.0 * slowest
-
-        def excess(y: FloatArray, rising: bool = rising, at: float = threshold) -> FloatArray:
-            return y - at if rising else at - y
-
-        piece = _Piece(modes, rates, z, level, corners, now)
-        crossing = piece.first_rise(excess, length)
+        piece = _Piece(modes, rates, states, level, corners, now)
+        crossing = piece.first_crossing(threshold, side, length)
         switching = not math.isnan(crossing)
         if not switching and not on_the_way:
             raise ModelError(
@@ -274,14 +264,15 @@ def simulate_relay(
         if step > 0.0:
             piece.length = step
             pieces.append(piece)
-            z, now = modes.move(z, step), now + step
+            states, now = modes.moved(states, step), now + step
         if switching:
             if now <= switches[-1][0]:
                 raise _no_delay(now)
-            rising, is_high = not rising, not is_high
-            threshold = settings.setpoint + (1 if rising else -1) * settings.hysteresis
-            switches.append((now, settings.high if is_high else settings.low))
-            on_the_way.append((now + dead_time, switches[-1][1]))
+            side = -side
+            threshold = settings.setpoint + side * settings.hysteresis
+            before = switches[-1][1]
+            switches.append((now, settings.low if before == settings.high else settings.high))
+            on_the_way.append((now + dead_time, switches[-1][1] - before))
             if len(switches) > _MOST_SWITCHES:
                 raise ModelError(
                     f"{_MOST_SWITCHES} switches by t = {now:g} s: the relay chatters on this "

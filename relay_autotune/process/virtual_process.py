@@ -96,11 +96,10 @@ class Plant:
         self.time = 0.0
         self._dead_time = model.dead_time
         self._modes = Modes.of(model)
-        self._z = self._modes.rest()
-        self._states, self._rounding = self._modes.split(self._z), 0.0
+        self._states, self._rounding = self._modes.rest(), 0.0
         self._since = 0.0
         self._command = initial_command
-        self._arrived = initial_command
+        # When the process sees the command change, and by how much.
         self._on_the_way: deque[tuple[float, float]] = deque()
 
     def advance(self, time: float, command: float) -> float:
@@ -114,7 +113,7 @@ class Plant:
         if time < self.time:
             raise ModelError(f"the plant is at {self.time:g} s and cannot go back to {time:g} s")
         if command != self._command:
-            self._on_the_way.append((self.time + self._dead_time, command))
+            self._on_the_way.append((self.time + self._dead_time, command - self._command))
             self._command = command
         while self._on_the_way and self._on_the_way[0][0] <= time:
             self._arrive(*self._on_the_way.popleft())
@@ -123,12 +122,11 @@ class Plant:
         # At the arrival of the first command the parts cancel, but for rounding.
         return y if abs(y) > self._rounding else 0.0
 
-    def _arrive(self, time: float, command: float) -> None:
-        z = self._modes.move(self._z, time - self._since)
-        self._z = z + (command - self._arrived) * self._modes.input_direction
-        self._states = self._modes.split(self._z)
+    def _arrive(self, time: float, change: float) -> None:
+        moved = self._modes.moved(self._states, time - self._since)
+        self._states = self._modes.stepped(moved, change)
         self._rounding = _EPSILON * self._modes.size_of(self._states)
-        self._since, self._arrived = time, command
+        self._since = time
 
 
 @dataclass(frozen=True)
