@@ -28,6 +28,7 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.process.response import Coordinates, Modes
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.cycles import cycle_from_samples
 from relay_autotune.record.record import Cycle, PiecewiseConstant, RelaySettings
 from relay_autotune.scalar import root
 
@@ -119,7 +120,6 @@ class HalfCycle:
 
 # More switches than this count as chatter.
 _MOST_SWITCHES = 20_000
-_QUADRATURE = np.polynomial.legendre.leggauss(8)
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,8 @@ class RelayRun:
     """Result of an ideal relay experiment.
 
     :param command: the command with its exact switch instants.
-    :param cycles: every whole cycle, with exact times and peaks.
+    :param cycles: every whole cycle, with exact times and peaks; the mean of the measurement is
+        that of straight lines.
     :param output: returns the noise-free measurement at instants of the run [y].
     """
 
@@ -281,7 +282,7 @@ def simulate_relay(
     times, levels = (np.array(column) for column in zip(*switches, strict=True))
     command = PiecewiseConstant(times, levels, settings.baseline)
     first = 0 if kept is None else max(cycles - kept, 0)
-    found = tuple(_cycle(k, times, pieces, settings) for k in range(first, cycles))
+    found = tuple(_cycle(k, command, pieces, settings) for k in range(first, cycles))
     ends = np.array([piece.begin for piece in pieces[1:]] + [now])
 
     def output(at: FloatArray) -> FloatArray:
@@ -301,39 +302,23 @@ def _no_delay(time: float) -> ModelError:
 
 
 def _cycle(
-    index: int, switches: FloatArray, pieces: list[_Piece], settings: RelaySettings
+    index: int, command: PiecewiseConstant, pieces: list[_Piece], settings: RelaySettings
 ) -> Cycle:
-    """Return a whole cycle, whose first half begins with the switch to the high level."""
-    k = 2 * index + (1 if settings.reverse_acting else 2)
-    begins = np.array([piece.begin for piece in pieces])
-    halves, area = [], 0.0
-    nodes, weights = _QUADRATURE
-    for half in range(2):
-        own = slice(*np.searchsorted(begins, switches[k + half : k + half + 2]))
-        times, values = [], []
-        for piece in pieces[own]:
+    """Return a whole cycle by samples that hold its switches and extremes."""
+    first = 2 * index + (1 if settings.reverse_acting else 2)
+    begin, end = command.times[[first, first + 2]]
+    times, values = [], []
+    for piece in pieces:
+        if begin <= piece.begin < end:
             at = piece.instants(piece.length)
-            times.append(piece.begin + at - switches[k + half])
+            times.append(piece.begin + at)
             values.append(piece.output(at))
-            cell = 0.5 * np.diff(at)[:, None]
-            inner = at[:-1, None] + cell * (nodes + 1.0)
-            area += float(
-                np.sum(piece.output(inner.ravel()).reshape(inner.shape) * weights * cell)
-            )
-        halves.append((np.concatenate(times), np.concatenate(values)))
-    # The low level turns a direct-acting process down, the high level a reverse-acting one.
-    (late, down), (early, up) = halves if settings.reverse_acting else halves[::-1]
-    t_high, t_low = (float(t) for t in np.diff(switches[k : k + 3]))
-    return Cycle(
-        index=index,
-        start=float(switches[k]),
-        period=t_high + t_low,
-        period_high=t_high,
-        period_low=t_low,
-        peak_max=float(down.max()),
-        peak_min=float(up.min()),
-        time_to_peak_max=float(late[np.argmax(down)]),
-        time_to_peak_min=float(early[np.argmin(up)]),
-        mean_measurement=area / (t_high + t_low),
-        mean_command=(settings.high * t_high + settings.low * t_low) / (t_high + t_low),
+    time = np.concatenate(times)
+    return cycle_from_samples(
+        index,
+        time,
+        np.concatenate(values),
+        command(time[:-1]),
+        middle=settings.baseline + settings.bias,
+        reverse_acting=settings.reverse_acting,
     )
