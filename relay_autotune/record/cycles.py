@@ -65,22 +65,6 @@ class RelayStretch:
     down: IntArray
 
 
-@cached_on_record
-def find_cycles(record: Record) -> tuple[int, ...]:
-    """Return the samples at which cycles begin, from the switches of the command alone.
-
-    Levels before and after the oscillation (a baseline, a manual step) may differ from the two
-    levels of the relay. A stay at a level of less than a tenth of the usual one counts as noise at
-    a switch and begins no cycle.
-
-    :param record: a record of any origin.
-    :returns: indices as in ``Record.cycle_start``; empty if the command does not switch to a
-        high level from a low one at least twice, or by the clock.
-    """
-    stretch = find_relay(record)
-    return () if stretch is None else tuple(int(i) for i in stretch.up)
-
-
 def infer_settings(record: Record) -> RelaySettings | None:
     """Estimate the settings of a relay from a record that carries none.
 
@@ -157,8 +141,13 @@ def is_switched(record: Record) -> bool:
     return np.unique(record.command[last]).size < _MAX_LEVELS
 
 
+@cached_on_record
 def find_relay(record: Record) -> RelayStretch | None:
     """Return the longest stretch in which the command switches between two levels.
+
+    Levels before and after the oscillation (a baseline, a manual step) may differ from the two
+    levels of the relay. A stay at a level of less than a tenth of the usual one counts as noise at
+    a switch and begins no cycle.
 
     :param record: a record of any origin.
     :returns: the stretch; None without two switches from a lower to a higher level, or if they
@@ -477,13 +466,15 @@ def cycle_bounds(record: Record) -> tuple[int, ...]:
     """Return the samples at which the cycles of a record begin, and at which the last one ends.
 
     They are ``record.cycle_start``. If that is empty and the outcome is unknown (a truncated
-    recording, or one of another program), they are those of :func:`find_cycles`.
+    recording, or one of another program), they are the switches to the high level that
+    :func:`find_relay` finds; none if it finds no relay.
 
     :param record: the record of an experiment.
     """
     if record.cycle_start or record.outcome is not Outcome.UNKNOWN:
         return record.cycle_start
-    return find_cycles(record)
+    stretch = find_relay(record)
+    return () if stretch is None else tuple(stretch.up.tolist())
 
 
 @dataclass(frozen=True)

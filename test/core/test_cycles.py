@@ -22,9 +22,9 @@ from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.cycles import (
     agree,
+    cycle_bounds,
     cycle_from_samples,
     cycles_of,
-    find_cycles,
     infer_settings,
     limit_cycle,
 )
@@ -226,7 +226,7 @@ def test_a_record_stripped_of_its_settings_gives_them_back(gain, noise, sign):
     )
     bare = Record(time=record.time, measurement=record.measurement, command=record.command)
     # The last cycle ends with the baseline and not with a switch to the high level.
-    assert find_cycles(bare) == record.cycle_start[:-1]
+    assert cycle_bounds(bare) == record.cycle_start[:-1]
     found, truth = infer_settings(bare), record.settings
     assert found.amplitude == pytest.approx(truth.amplitude)
     assert found.bias == pytest.approx(truth.bias)
@@ -247,7 +247,7 @@ def test_an_experiment_of_ours_without_cycles_has_none():
 
 def test_levels_before_and_after_the_oscillation_are_no_cycles():
     record = square([8.0, 2.0] * 4, 10, lead=[5.0] * 30 + [0.0] * 7, tail=[5.0] * 9)
-    assert find_cycles(record) == (57, 77, 97)
+    assert cycle_bounds(record) == (57, 77, 97)
     assert infer_settings(record) == replace(
         infer_settings(record), baseline=5.0, amplitude=3.0, bias=0.0
     )
@@ -268,7 +268,7 @@ def test_moments_of_noise_begin_no_cycle():
     turns = [0, 43, 103, 144, 205, 247]
     y = np.interp(np.arange(command.size), turns, [0.0, 1.0] * 3)
     record = Record(time=time, measurement=y, command=command)
-    assert find_cycles(record) == (103, 205)
+    assert cycle_bounds(record) == (103, 205)
 
 
 def test_a_square_wave_by_the_clock_is_no_relay():
@@ -280,8 +280,8 @@ def test_a_square_wave_by_the_clock_is_no_relay():
     record = Record(time=time, measurement=y, command=u(time))
     # the same switches are a relay's if the measurement had come to its level just before
     late = replace(record, measurement=np.interp(time, u.times, np.tile([-1.0, 1.0], 10)[:19]))
-    assert find_cycles(late)
-    assert find_cycles(record) == cycles_of(record) == ()
+    assert cycle_bounds(late)
+    assert cycle_bounds(record) == cycles_of(record) == ()
     assert infer_settings(record) is None
 
 
@@ -301,7 +301,7 @@ def test_commands_that_are_no_relay(command):
     record = Record(
         time=np.arange(command.size), measurement=np.zeros(command.size), command=command
     )
-    assert find_cycles(record) == ()
+    assert cycle_bounds(record) == ()
     assert infer_settings(record) is None
     assert cycles_of(record) == ()
 
@@ -314,7 +314,7 @@ def test_commands_that_are_no_relay(command):
 def test_any_command_gives_valid_cycles(command, steps):
     time = np.cumsum(steps[: len(command)])
     record = Record(time=time, measurement=np.sin(time), command=np.array(command))
-    bounds = find_cycles(record)
+    bounds = cycle_bounds(record)
     assert len(replace(record, cycle_start=bounds).cycle_start) == len(bounds)
     for k in bounds:
         assert record.command[k] > record.command[k - 1]
