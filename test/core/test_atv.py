@@ -25,13 +25,11 @@ from relay_autotune.identification.methods.chang import (
 )
 from relay_autotune.identification.methods.lags import (
     FIRST,
-    MODEL_4,
-    MODEL_5,
     equal,
     solutions,
     with_amplitude,
 )
-from relay_autotune.process.structures import equal_lags
+from relay_autotune.process.structures import SOPDT, TWO_EQUAL_ONE, equal_lags
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record, RelaySettings
@@ -41,9 +39,9 @@ LAGS = [
     (equal_lags(2), (3.0,)),
     (equal_lags(3), (3.0,)),
     (equal_lags(5), (3.0,)),
-    (MODEL_4, (3.0, 1.0)),
-    (MODEL_5, (1.0, 5.0)),
-    (MODEL_5, (10.0, 3.0)),
+    (SOPDT, (3.0, 1.0)),
+    (TWO_EQUAL_ONE, (1.0, 5.0)),
+    (TWO_EQUAL_ONE, (10.0, 3.0)),
 ]
 
 
@@ -87,10 +85,10 @@ def test_a_limit_cycle_of_the_describing_function_gives_the_process(model, const
     cycle = SymmetricCycle(2.0 * math.pi / w, amplitude, relay, epsilon, dead_time)
     found = atv_from_numbers(cycle, Known(gain=2.0, structure=model.name, order=model.order))
     every = [found.values[1:-1]]
-    if model == MODEL_5:
+    if model == TWO_EQUAL_ONE:
         every = [np.array(s[1:]) for s in solutions(model, cycle, 2.0, FIRST)]
     assert min(np.abs(s / constants - 1.0).max() for s in every) < 1e-9
-    if epsilon == 0.0 and model != MODEL_5:
+    if epsilon == 0.0 and model != TWO_EQUAL_ONE:
         assert found.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=1e-9)
         chosen = atv_from_numbers(cycle, Known(gain=2.0))
         assert (chosen.structure, chosen.model.order) in {
@@ -149,7 +147,7 @@ def test_numbers_that_cannot_be_are_refused():
         equal(1, at(2.4), wave=FIRST)
     with pytest.raises(IdentificationError, match="gain given is too small"):
         with_amplitude((1.0,), 10.0, 1.3, FIRST)
-    for model in (MODEL_4, MODEL_5):
+    for model in (SOPDT, TWO_EQUAL_ONE):
         with pytest.raises(IdentificationError, match="less lag than fopdt"):
             solutions(model, at(4.0), 2.0, FIRST)
     with pytest.raises(IdentificationError, match="needs the gain"):

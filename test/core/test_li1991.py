@@ -17,25 +17,24 @@ from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.limit_cycle.limit_cycle import SymmetricCycle
 from relay_autotune.identification.methods import JOINT_METHODS, identify, identify_jointly
-from relay_autotune.identification.methods.lags import MODEL_1, MODEL_4, MODEL_5
 from relay_autotune.identification.methods.li import (
     describing_function_point,
     fit_jointly,
     fits_jointly,
     li_from_numbers,
 )
-from relay_autotune.process.structures import equal_lags
+from relay_autotune.process.structures import FOPDT, SOPDT, TWO_EQUAL_ONE, equal_lags
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import Record, RelaySettings
 
 CASES = [
-    (MODEL_1, (2.0, 3.0, 1.0)),
-    (MODEL_1, (1.65, 20.0, 10.0)),
+    (FOPDT, (2.0, 3.0, 1.0)),
+    (FOPDT, (1.65, 20.0, 10.0)),
     (equal_lags(2), (2.0, 3.0, 1.0)),
     (equal_lags(3), (2.0, 3.0, 1.0)),
-    (MODEL_4, (2.0, 3.0, 1.0, 0.5)),
-    (MODEL_5, (2.0, 1.0, 5.0, 0.5)),
+    (SOPDT, (2.0, 3.0, 1.0, 0.5)),
+    (TWO_EQUAL_ONE, (2.0, 1.0, 5.0, 0.5)),
 ]
 
 
@@ -58,7 +57,7 @@ def test_two_exact_limit_cycles_give_all_parameters(model, values, epsilon):
     for dead_time in (values[-1], math.nan):
         fit = fit_jointly(model, tests, dead_time)
         assert fit.misfit < 1e-8
-        if model == MODEL_5 and math.isnan(dead_time):
+        if model == TWO_EQUAL_ONE and math.isnan(dead_time):
             # Either of two mirrored solutions may be found; both have these limit cycles.
             continue
         assert fit.values == pytest.approx(values, rel=1e-6)

@@ -44,9 +44,6 @@ from relay_autotune.identification.methods.lags import (
     EXACT,
     FIRST,
     MIXED,
-    MODEL_1,
-    MODEL_4,
-    MODEL_5,
     STRUCTURES,
     Wave,
     equal,
@@ -57,7 +54,7 @@ from relay_autotune.identification.methods.lags import (
 from relay_autotune.identification.methods.solved import literally, solved, structure_asked_for
 from relay_autotune.identification.result import Identification
 from relay_autotune.process.simulation import HalfCycle
-from relay_autotune.process.structures import Structure, equal_lags
+from relay_autotune.process.structures import FOPDT, SOPDT, TWO_EQUAL_ONE, Structure, equal_lags
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 
@@ -240,7 +237,7 @@ class LagProblem:
             if excesses[order] < 0.0:
                 break
         # Between two orders of equal lags lies a model with one lag more that differs.
-        between = {1: MODEL_1, 2: MODEL_4, 3: MODEL_5}.get(order)
+        between = {1: FOPDT, 2: SOPDT, 3: TWO_EQUAL_ONE}.get(order)
         nearest = min((n for n in excesses if n >= 3), key=lambda n: abs(excesses[n]), default=3)
         return between if between and excesses[order] < 0.0 else equal_lags(nearest), ""
 
@@ -258,7 +255,7 @@ class LagProblem:
                 away[order] = self.misfit(equal_lags(order), solution)
         if not away:
             # The error of the simplest model says what is wrong.
-            self.solve(MODEL_1)
+            self.solve(FOPDT)
         model = equal_lags(min(n for n in away if alike(away[n], min(away.values()))))
         why = "its simplicity" if self.test is None else "the shape of its half cycles"
         return model, (

@@ -192,16 +192,14 @@ MIXED = Wave(level, slope_sign, fundamental, 4.0 / math.pi)
 FIRST = Wave(first_level, first_slope_sign, fundamental, 4.0 / math.pi)
 
 
-MODEL_1, MODEL_4, MODEL_5 = FOPDT, SOPDT, TWO_EQUAL_ONE
-
 _STEP = 1.1
 _LONGEST = 1e10
 _NEARLY_ONE = 1.0 - 1e-12
 _WITH_LAG = 1.0 - 1e-6
 _NONE = 1e-12
 
-
-STRUCTURES = (FOPDT, LAG_N, MODEL_4, MODEL_5)
+# Models 1, 2 and 3, 4 and 5 of Chang et al.
+STRUCTURES = (FOPDT, LAG_N, SOPDT, TWO_EQUAL_ONE)
 
 
 def model_text(model: Structure) -> str:

@@ -38,19 +38,10 @@ from relay_autotune.identification.limit_cycle.limit_cycle import (
     relay_test,
 )
 from relay_autotune.identification.methods.chang import alike, shape_misfit
-from relay_autotune.identification.methods.lags import (
-    MODEL_1,
-    MODEL_4,
-    MODEL_5,
-    STRUCTURES,
-    equal,
-    level,
-    model_text,
-    peak,
-)
+from relay_autotune.identification.methods.lags import STRUCTURES, equal, level, model_text, peak
 from relay_autotune.identification.methods.solved import Fit, literally, structure_asked_for
 from relay_autotune.identification.result import Identification, identified
-from relay_autotune.process.structures import Structure, equal_lags
+from relay_autotune.process.structures import FOPDT, SOPDT, TWO_EQUAL_ONE, Structure, equal_lags
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 
@@ -70,7 +61,7 @@ _LEAST_AMPLITUDE_ERROR = 1e-3
 _SHARE_OF_INTERVAL = 0.3
 
 
-_CHOICE = (MODEL_1, equal_lags(2), equal_lags(3), MODEL_4, MODEL_5)
+_CHOICE = (FOPDT, equal_lags(2), equal_lags(3), SOPDT, TWO_EQUAL_ONE)
 
 
 @dataclass(frozen=True)
@@ -151,7 +142,7 @@ def fit_jointly(
         )
     cost, x = fit.best(starts)
     values = fit.values(x)
-    if model == MODEL_4:
+    if model == SOPDT:
         values[1:3] = max(values[1:3]), min(values[1:3])
     misfit = math.sqrt(cost / deviations.size)
     # A misfit above 1 shows that the assumed errors were too small.
