@@ -359,15 +359,19 @@ def cycle_from_samples(
     )
 
 
-def _longest_low(time: FloatArray, high: np.ndarray) -> int:
+def runs_of(there: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return where each run of samples begins, and the sample after its last one.
+
+    :param there: True within the runs, shape (n,).
+    """
+    edges = np.flatnonzero(np.diff(there, prepend=False, append=False))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _longest_low(time: FloatArray, high: NDArray[np.bool_]) -> int:
     """Return the first sample of the longest stay at the low level, 0 if there is none."""
-    edges = np.diff(high.astype(np.int8))
-    begins = np.flatnonzero(edges == -1) + 1
-    if begins.size == 0:
-        return 0
-    ends = np.append(np.flatnonzero(edges == 1) + 1, high.size)
-    ends = ends[ends > begins[0]]
-    return int(begins[np.argmax(time[ends] - time[begins])])
+    stays = [(begin, stop) for begin, stop in runs_of(~high) if begin]
+    return max(stays, key=lambda stay: time[stay[1]] - time[stay[0]], default=(0, 0))[0]
 
 
 def agree(cycles: Sequence[Cycle], noise_std: float, interval: float, tolerance: float) -> bool:
@@ -519,12 +523,7 @@ def limit_cycle(source: Record | Sequence[Cycle]) -> LimitCycle:
 
 
 def _steady_cycles(cycles: tuple[Cycle, ...]) -> tuple[tuple[Cycle, ...], bool]:
-    last = max((k for k, c in enumerate(cycles) if c.converged), default=None)
-    if last is None:
-        chosen = cycles[-MIN_CYCLES:]
-    else:
-        first = last
-        while first > 0 and cycles[first - 1].converged:
-            first -= 1
-        chosen = cycles[max(0, first + 1 - MIN_CYCLES) : last + 1]
-    return tuple(c for c in chosen if not c.disturbed) or chosen, last is not None
+    runs = runs_of(np.array([c.converged for c in cycles]))
+    first, stop = runs[-1] if runs else (len(cycles) - 1, len(cycles))
+    chosen = cycles[max(0, first + 1 - MIN_CYCLES) : stop]
+    return tuple(c for c in chosen if not c.disturbed) or chosen, bool(runs)

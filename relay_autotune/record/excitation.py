@@ -14,7 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relay_autotune.arrays import FloatArray, IntArray
-from relay_autotune.record.cycles import GAP_INTERVALS, follow_measurement, two_level_runs
+from relay_autotune.record.cycles import (
+    GAP_INTERVALS,
+    follow_measurement,
+    runs_of,
+    two_level_runs,
+)
 from relay_autotune.record.record import (
     Input,
     PiecewiseConstant,
@@ -239,15 +244,6 @@ def _unbroken(record: Record) -> list[tuple[int, int]]:
     begins = np.flatnonzero(kept & np.concatenate(([True], apart)))
     ends = np.flatnonzero(kept & np.concatenate((apart, [True])))
     return list(zip(begins.tolist(), ends.tolist(), strict=True))
-
-
-def runs_of(there: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return where each run of samples begins, and the sample after its last one.
-
-    :param there: True within the runs, shape (n,).
-    """
-    edges = np.flatnonzero(np.diff(there, prepend=False, append=False))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def at_its_ends(y: FloatArray, band: float = 0.0) -> list[tuple[int, int, float]]:

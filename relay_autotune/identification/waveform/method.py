@@ -64,12 +64,12 @@ from relay_autotune.identification.waveform.separable import (
 from relay_autotune.identification.waveform.starts import is_controlled
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, TABLE
+from relay_autotune.record.cycles import runs_of
 from relay_autotune.record.excitation import (
     MOST_AWAY,
     at_its_ends,
     changes_within,
     jumped_away,
-    runs_of,
     smooth,
 )
 from relay_autotune.record.record import Input, PiecewiseConstant, Record, roughness
