@@ -112,18 +112,15 @@ def _best(search: Search, asked: Bounds, derivative: bool) -> Optimum:
     found = search.optimum(asked, derivative=derivative)
     if found is not None:
         return found
-    kind, warnings = _KINDS[derivative], []
     if math.isfinite(search.noise):
-        quiet = replace(search, noise=math.inf)
-        found = quiet.optimum(asked, derivative=derivative)
+        found = _best(replace(search, noise=math.inf), asked, derivative)
         warning = (
             "no controller keeps both the bounds and the limit of the noise in the command: the "
             "noise is not limited; a smaller noise_std, a larger noise_share or a slower sensor "
             "filter would"
         )
-        if found is not None:
-            return replace(found, warnings=(warning,))
-        search, warnings = quiet, [warning]
+        return replace(found, warnings=(warning, *found.warnings))
+    kind, warnings = _KINDS[derivative], []
     least_ms = search.least_ms(derivative=derivative)
     if least_ms > MS_RANGE[1]:
         raise TuningError(_cannot_hold(search, kind, least_ms))
