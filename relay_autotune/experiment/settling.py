@@ -360,8 +360,8 @@ class ResponseDetector:
         """Half width of the band about the rest [y]."""
         self._run_needed = _RUN if rest.noise_std > 0.0 else 1
         self._latest = start
+        # Samples in a row outside the band, negative below it.
         self._run = 0
-        self._run_side = 0
         self.side = 0
         """Side of the rest on which the response began, 1 or -1; set once it is seen."""
         self.last_inside = start
@@ -377,15 +377,14 @@ class ResponseDetector:
             self._run = 0
             self.last_inside = time
             return False
-        if side != self._run_side or self._run == 0:
-            if self._run > 0:
+        if side * self._run <= 0:
+            if self._run:
                 # A jump from one side to the other is noise, and counts as inside.
                 self.last_inside = self._latest
-            self._run, self._run_side = 0, side
-            self.first_outside = time
-        self._run += 1
+            self._run, self.first_outside = 0, time
+        self._run += side
         self._latest = time
-        if self._run < self._run_needed:
+        if abs(self._run) < self._run_needed:
             return False
         self.side = side
         return True
