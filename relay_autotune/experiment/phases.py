@@ -308,14 +308,12 @@ class Settle:
         if watch is not None and watch.has_moved_to(rest.mean):
             moved = {"rest": watch.rested_at, "value": rest.mean}
             run.notes.append(Code.NOTE_MOVED(**moved, baseline=run.baseline))
-        run.facts = Facts(
-            rest=rest,
-            settled_at=trace.seen[-1],
-            kicked_at=trace.time[-1],
-            setpoint=rest.mean if math.isnan(p.setpoint) else p.setpoint,
-            hysteresis=p.band(rest.noise_std),
-            sign=p.process_gain_sign,
-        )
+        facts = run.facts
+        facts.rest = rest
+        facts.settled_at = trace.seen[-1]
+        facts.kicked_at = trace.time[-1]
+        facts.setpoint = rest.mean if math.isnan(p.setpoint) else p.setpoint
+        facts.hysteresis = p.band(rest.noise_std)
         return State.KICK
 
     def status(self, t: float, _: float) -> str:
