@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import astuple, dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from scipy.special import fdtrc
@@ -160,18 +159,6 @@ _SHARP_FOPDT = 0.2
 _NEARLY_ONE = 1.0 - 1e-14
 
 
-class Curve(Protocol):
-    """A signal with its rate, at any times [s], shape (n,)."""
-
-    def __call__(self, time: FloatArray, /) -> FloatArray:
-        """Return its values [y], shape (n,)."""
-        ...
-
-    def slope(self, time: FloatArray, /) -> FloatArray:
-        """Return its rates [y/s], shape (n,)."""
-        ...
-
-
 @dataclass(frozen=True)
 class Shape:
     """Shape factors of the half of a limit cycle in which the deviation is positive.
@@ -261,7 +248,7 @@ def _widened(shape: Shape) -> float:
 
 
 def shape_of_curve(
-    y: Curve, half_period: float, *, edge: float = math.nan, tolerance: float = 0.0
+    y: HalfCycle | _Half, half_period: float, *, edge: float = math.nan, tolerance: float = 0.0
 ) -> Shape:
     """Measure the shape of one half of a limit cycle.
 
@@ -318,7 +305,7 @@ def shape_of_curve(
     )
 
 
-def _at(y: Curve, time: float) -> float:
+def _at(y: HalfCycle | _Half, time: float) -> float:
     return float(y(np.array([time]))[0])
 
 
