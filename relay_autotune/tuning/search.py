@@ -227,11 +227,6 @@ class Search:
         """Return the first of some candidates, with the sign of the process."""
         return best.controller(0, self.model.process_sign, self.rate)
 
-    def _peaks(self, controller: Controller) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return Ms and Mt of a controller on the process, each with its frequency."""
-        exact = Loop(self.rate.of(controller), self.model)
-        return peaks(exact, exact.grid)
-
     def _ceiling(self, kp: FloatArray) -> FloatArray | float:
         """Return the integral gains that each proportional gain allows by itself, shape (k,)."""
         # An integral that is advanced before the output takes a part of kp'; the rest is kp.
@@ -329,11 +324,9 @@ class Search:
         :param iae: there [y s/u].
         """
         for _ in range(_MOST_ADDED):
-            found = zip(
-                self._peaks(self._controller(self._at(bounds, point[None]))),
-                (bounds.ms, bounds.mt),
-                strict=True,
-            )
+            controller = self._controller(self._at(bounds, point[None]))
+            exact = Loop(self.rate.of(controller), self.model)
+            found = zip(peaks(exact, exact.grid), (bounds.ms, bounds.mt), strict=True)
             missed = [w for (peak, w), bound in found if peak > _HELD * bound]
             if not missed:
                 break
