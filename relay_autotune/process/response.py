@@ -241,14 +241,13 @@ class Modes:
         every: list[complex] = []
         for group, paired in zip(groups, upper, strict=True):
             every += [e for pole in group for e in (pole, pole.conjugate())] if paired else group
-        taken: list[list[complex]] = [[] for _ in range(numerators.shape[1])]
+        ratios = []
         for group in groups:
             others = list(every)
             for e in group:
                 others.remove(e)
-            for row, more in zip(taken, _of_ratios(group, others, len(taken)), strict=True):
-                row += more
-        every_row = numerators @ (np.array(taken) / lead)
+            ratios.append(_of_ratios(group, others, numerators.shape[1]))
+        every_row = numerators @ (np.concatenate(ratios, axis=1) / lead)
         self._clusters: list[_Cluster] = []
         first = 0
         for group, paired in zip(groups, upper, strict=True):
