@@ -268,11 +268,8 @@ def _by_ultimate_point(name: str, task: DesignTask) -> tuple[Controller, str]:
     :param task: a stable or integrating process with an ultimate point.
     :raises TuningError: for any other, or if the limit cycle is not known.
     """
-    row, point, whose = (
-        _ULTIMATE[name.removesuffix("_cycle")],
-        own_point(name, task),
-        "model itself",
-    )
+    row = _ULTIMATE[name.removesuffix("_cycle")]
+    point, whose = own_point(name, task), "model itself"
     if name not in _ULTIMATE:
         if task.describing is None:
             raise TuningError(
