@@ -351,10 +351,8 @@ class RelayExperiment:
             found = self._phase.command
         if isinstance(found, Reason):
             command = self._end(_ENDS.get(found.code, State.FAILED), found, y)
-        elif self.parameters.command_rate > 0.0:
-            command = self._rate_limited(found)
         else:
-            command = found
+            command = self._rate_limited(found)
         trace.command.append(command)
         return command
 
@@ -408,11 +406,11 @@ class RelayExperiment:
         return self.after_end(measurement)
 
     def _rate_limited(self, wanted: float) -> float:
-        samples = self._trace
-        if len(samples) < 2:
+        samples, rate = self._trace, self.parameters.command_rate
+        if rate == 0.0 or len(samples) < 2:
             return wanted
         before = samples.command[-1]
-        step = self.parameters.command_rate * (samples.time[-1] - samples.time[-2])
+        step = rate * (samples.time[-1] - samples.time[-2])
         return min(max(wanted, before - step), before + step)
 
     @property
