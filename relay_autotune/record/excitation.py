@@ -182,8 +182,8 @@ def longest_stay(time: FloatArray, u: Input) -> float:
     :param time: of the samples [s], shape (n,).
     :param u: the input.
     """
-    inside = u.times[(u.times > time[0]) & (u.times < time[-1])]
-    return float(np.max(np.diff(np.concatenate((time[:1], inside, time[-1:])))))
+    changes = changes_within(u, time)
+    return float(np.max(np.diff(np.concatenate((time[:1], changes, time[-1:])))))
 
 
 def answering_time(time: FloatArray, u: Input) -> float:
@@ -480,7 +480,6 @@ def _steps(
     returns = levels.size > 2 and levels[-1] == levels[0]
     kind = "pulses" if returns else "steps"
     what = ("pulse" if returns else "step") if levels.size <= 3 else kind
-    what = "step" if levels.size == 2 else what
     return [(*part, kind, f"{what} of the command from {listed}")]
 
 
