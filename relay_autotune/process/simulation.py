@@ -110,11 +110,9 @@ class HalfCycle:
             return 0.0
         at = np.arange(n, dtype=np.float64) * self.half_period
         rates = self._rates.outputs(self._later, at)[0]
-        denominator = np.ones(1, dtype=np.complex128)
-        for pole in self._poles:
-            denominator = np.convolve(denominator, [1.0, -np.exp(pole * self.half_period)])
+        denominator = np.poly(np.exp(np.array(self._poles) * self.half_period)).real
         # Its powers of 1/lambda, lowest first, are those of lambda, highest first.
-        roots = np.roots(np.convolve(rates, denominator.real)[:n])
+        roots = np.roots(np.convolve(rates, denominator)[:n])
         return float(np.max(np.abs(roots))) if roots.size else 0.0
 
 

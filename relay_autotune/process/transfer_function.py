@@ -39,10 +39,8 @@ def _conjugate_closed(values: tuple[complex, ...]) -> bool:
 
 def _real_product(constants: Sequence[complex]) -> NDArray[np.float64]:
     """Coefficients of prod(1 + c s), highest power first."""
-    product = np.ones(1, dtype=np.complex128)
-    for constant in constants:
-        product = np.convolve(product, np.array([constant, 1.0]))
-    return np.ascontiguousarray(product.real)
+    # prod(s + c) has the same coefficients in the other order.
+    return np.atleast_1d(np.poly([-c for c in constants]).real)[::-1]
 
 
 @dataclass(frozen=True)
