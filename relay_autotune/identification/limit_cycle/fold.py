@@ -449,26 +449,15 @@ def _overlaid(
 ) -> tuple[FloatArray, NDArray[np.bool_], FloatArray, float, float]:
     """Return of all samples the time since the last switch, the level and y; mean half periods."""
     middle, bounds = settings.baseline + settings.bias, cycle_bounds(record)
-    since, is_high, y, highs, lows = [], [], [], [], []
-    for index in chosen:
-        first, last = bounds[index], bounds[index + 1]
-        up, down, end = _switches(record, first, last, middle)
-        t = record.time[first : last + 1]
-        inside = (t >= up) & (t < end)
-        t = t[inside]
-        at_high = t < down
-        since.append(t - np.where(at_high, up, down))
-        is_high.append(at_high)
-        y.append(record.measurement[first : last + 1][inside])
-        highs.append(down - up)
-        lows.append(end - down)
-    return (
-        np.concatenate(since),
-        np.concatenate(is_high),
-        np.concatenate(y),
-        float(np.mean(highs)),
-        float(np.mean(lows)),
-    )
+    switches = [_switches(record, bounds[c], bounds[c + 1], middle) for c in chosen]
+    up, down, end = np.array(switches).T
+    cycle = np.searchsorted(up, record.time, side="right") - 1
+    inside = (cycle >= 0) & (record.time < end[cycle])
+    time, cycle = record.time[inside], cycle[inside]
+    is_high = time < down[cycle]
+    since = time - np.where(is_high, up[cycle], down[cycle])
+    half_periods = float(np.mean(down - up)), float(np.mean(end - down))
+    return since, is_high, record.measurement[inside], *half_periods
 
 
 def switched_at(record: Record, samples: Sequence[int]) -> FloatArray:
