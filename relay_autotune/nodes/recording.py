@@ -61,18 +61,22 @@ which command."""
 
 
 class Recording:
-    """Record one experiment; any error becomes a sentence in `failure`, never an exception.
+    """Record one experiment; any error becomes a sentence of `problem`, never an exception.
 
     :param node: the node, whose timers and log are used.
     :param ends: the publisher or subscription of each topic, by the topic's unresolved name:
         ``measurement``, ``command`` and those of ``MESSAGES``.
-    :param path: the folder to create, with the name of the experiment.
+    :param directory: where its folder is created.
+    :param experiment_id: id of the experiment, which names the folder.
     """
 
-    def __init__(self, node: Node, ends: Mapping[str, Any], path: Path) -> None:
-        self.path = path
-        self.failure = ""
-        """What is wrong with it; empty: nothing is."""
+    def __init__(
+        self, node: Node, ends: Mapping[str, Any], directory: str, experiment_id: str
+    ) -> None:
+        # Absolute, since whoever reads the path may be in another folder.
+        self.path = Path(directory).expanduser().absolute() / experiment_id
+        self._failure = ""
+        self._is_told = False
         self._node = node
         self._names = {name: end.topic_name for name, end in ends.items()}
         self._topics = [
@@ -218,10 +222,23 @@ class Recording:
             cause = f": {self._reason}" if self._reason else ""
             self._closed(f"no {missing}{cause}" if missing else "")
 
-    def join(self, timeout: float) -> bool:
-        """Wait until the bag is finished, for ``timeout`` seconds at most; True if it is."""
+    def problem(self) -> str:
+        """Return what is wrong with it, or ""; it is logged once."""
+        if self._failure and not self._is_told:
+            self._is_told = True
+            self._node.get_logger().error(f"the tune goes on, but {self._failure}")
+        return self._failure
+
+    def join(self, timeout: float) -> None:
+        """Wait until the bag is finished, and log if it is not.
+
+        :param timeout: how long to wait at most [s].
+        """
         self._thread.join(timeout)
-        return not self._thread.is_alive()
+        if self._thread.is_alive():
+            self._node.get_logger().error(
+                f"the recording {self.path} could not be finished within {timeout:g} s"
+            )
 
     # Its thread.
 
@@ -243,7 +260,7 @@ class Recording:
             self._finished()
         except Exception as error:  # noqa: BLE001  a recorder must not end an experiment
             problem = str(error) or type(error).__name__
-            self.failure = problem if self._opened.is_set() else f"not recorded: {problem}"
+            self._failure = problem if self._opened.is_set() else f"not recorded: {problem}"
             self._opened.set()
             # Nothing is written after a failure, so the queues are emptied.
             while not self._closing.wait(FLUSH_PERIOD):
@@ -269,50 +286,3 @@ def _taken_from(queue: SimpleQueue[Any]) -> Any:
     with contextlib.suppress(Empty):
         while True:
             yield queue.get_nowait()
-
-
-class Recordings:
-    """The recordings of a node's experiments.
-
-    :param node: the node, whose timers and log are used.
-    :param ends: returns what `Recording` takes.
-    """
-
-    def __init__(self, node: Node, ends: Callable[[], dict[str, Any]]) -> None:
-        self._node, self._ends = node, ends
-        # The newest last.
-        self._kept: list[Recording] = []
-        self._reported = ""
-
-    def begin(self, experiment_id: str, directory: str) -> Recording:
-        """Open the recording of an experiment.
-
-        :param experiment_id: its id, which names the folder.
-        :param directory: where the folder is made.
-        """
-        # Absolute, since whoever reads the path may be in another folder.
-        folder = Path(directory).expanduser().absolute() / experiment_id
-        recording = Recording(self._node, self._ends(), folder)
-        self._kept = [*(each for each in self._kept if not each.is_closed), recording]
-        return recording
-
-    def problem(self) -> str:
-        """Return what is wrong with the newest recording, or ""; a new problem is logged."""
-        problem = self._kept[-1].failure if self._kept else ""
-        if problem and problem != self._reported:
-            self._reported = problem
-            self._node.get_logger().error(f"the tune goes on, but {problem}")
-        return problem
-
-    def close_all(self, why: str, timeout: float) -> None:
-        """Close all recordings and wait for the newest to be finished.
-
-        :param why: end of the sentence "the recording is closed ...".
-        :param timeout: how long to wait at most [s].
-        """
-        for recording in self._kept:
-            recording.close(why)
-        if self._kept and not self._kept[-1].join(timeout):
-            self._node.get_logger().error(
-                f"the recording {self._kept[-1].path} could not be finished within {timeout:g} s"
-            )

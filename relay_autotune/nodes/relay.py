@@ -29,7 +29,7 @@ from relay_autotune.nodes.loop_ends import LoopSupervisor
 from relay_autotune.nodes.parameters import ask_before_changes, declare, values_of
 from relay_autotune.nodes.quality import NO_REPEAT_AFTER, why_unconnected
 from relay_autotune.nodes.readiness import Checklist, Readiness, Ready, answer_of, require_settable
-from relay_autotune.nodes.recording import Recordings
+from relay_autotune.nodes.recording import Recording
 from relay_autotune.nodes.results import MODEL, SIGNS_OF_LIFE, OwnResults, said_by
 from relay_autotune.nodes.session import Session, SetpointSession
 from relay_autotune.nodes.tables import FIXED_PARAMETERS, TUNE_PARAMETERS
@@ -91,7 +91,6 @@ class RelayNode(ServedNode):
         hears(DiagnosticStatus, SIGNS_OF_LIFE, self._on_status, quality.RESULT)
         self._hear = self._sensor.hear
         self._topic = self._sensor.subscription.topic_name
-        self._recordings = Recordings(self, self._recorded)
         self._results = OwnResults(self)
         self._arrival = arrival(self)
         # The others of the loop go on while it waits.
@@ -101,6 +100,8 @@ class RelayNode(ServedNode):
         self._action = serve_tunes(self, self._arrival, self._request, self._cancel)
         # The tune that runs, and before it those whose gains are awaited, by their ids.
         self._tunes: dict[str, Session] = {}
+        # Of the newest tune.
+        self._recording: Recording | None = None
         self._narrator = Narrator(self, self._words, self._tell)
         self.create_timer(1.0, self._publish_diagnostics, clock=STEADY)
         require_settable(self, (), self._running)
@@ -222,17 +223,19 @@ class RelayNode(ServedNode):
         if self._on_setpoint:
             kind = partial(SetpointSession, actual=lambda: self._loop.handover.last)
         present = self.get_parameter("baseline_is_present").value
-        recording = self._recordings.begin(identity, self.get_parameter("record_directory").value)
+        experiment = RelayExperiment(
+            parameters,
+            ready.baseline,
+            identity,
+            policy=policy,
+            until_converged=converged,
+            from_small=ready.from_small,
+            before=self._sensor.samples.before() if present else None,
+        )
+        directory = self.get_parameter("record_directory").value
+        self._recording = recording = Recording(self, self._recorded(), directory, identity)
         session = kind(
-            RelayExperiment(
-                parameters,
-                ready.baseline,
-                identity,
-                policy=policy,
-                until_converged=converged,
-                from_small=ready.from_small,
-                before=self._sensor.samples.before() if present else None,
-            ),
+            experiment,
             recording,
             clock=self._now_ns if self._simulated else None,
             repeats=self._hear is not None,
@@ -247,7 +250,7 @@ class RelayNode(ServedNode):
         self._session = self._tunes[identity] = session
         self._loop.take(session.experiment)
         self.defer(self._narrator.now)
-        return identity, self._recordings.problem() or f"recorded in {recording.path}"
+        return identity, recording.problem() or f"recorded in {recording.path}"
 
     # While a tune runs.
 
@@ -377,7 +380,7 @@ class RelayNode(ServedNode):
 
         def closed(missing: str) -> None:
             del self._tunes[session.id]
-            bag = "" if self._recordings.problem() else str(session.recording.path)
+            bag = "" if session.recording.problem() else str(session.recording.path)
             if goal is not None:
                 without = "; ".join(filter(None, (lost, missing)))
                 goal.end(session.message(arrays=False), bag, without)
@@ -403,7 +406,10 @@ class RelayNode(ServedNode):
             self.work_off()
             self._experiments.wait_for_all_acked(ACKNOWLEDGE)
         finally:
-            self._recordings.close_all(f"because {reason}", CLOSE_WITHIN)
+            for tune in [*self._tunes.values()]:
+                tune.recording.close(f"because {reason}")
+            if self._recording is not None:
+                self._recording.join(CLOSE_WITHIN)
 
     # Status.
 
@@ -441,7 +447,8 @@ class RelayNode(ServedNode):
         elif self._sensor.age > self._sensor.timeout:
             why = why_unconnected(self, self._topic, self._reader.type_name, hears=True)
             problems.append(f"no measurement comes: {why}")
-        problems += filter(None, (self._recordings.problem(), self._loop.problem))
+        unrecorded = "" if self._recording is None else self._recording.problem()
+        problems += filter(None, (unrecorded, self._loop.problem))
         held = "idle" if self._loop.held is None else "holding"
         values: dict[str, object] = {
             "state": "passing" if self._loop.is_driven else held,

@@ -20,7 +20,7 @@ from std_msgs.msg import Float64
 from relay_autotune import nodes
 from relay_autotune.cli.own_nodes import free_domain
 from relay_autotune.nodes import recording as recording_module
-from relay_autotune.nodes.recording import RESULTS, Recordings
+from relay_autotune.nodes.recording import RESULTS, Recording
 from relay_autotune.nodes.results import SignsOfLife, said_by
 from relay_autotune_msgs.msg import PidGains, TransferFunction
 
@@ -47,12 +47,11 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
     results = dict(zip(RESULTS, (TransferFunction, PidGains), strict=True))
     topics = {"measurement": Float64, "command": Float64, **results}
     ends = {name: node.create_publisher(kind, name, 10) for name, kind in topics.items()}
-    recordings = Recordings(node, lambda: ends)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     for experiment, complete in (("whole", True), ("lacking", False)):
-        recording = recordings.begin(experiment, str(tmp_path))
-        assert recordings.problem() == "" and recording.path == tmp_path / experiment
+        recording = Recording(node, ends, str(tmp_path), experiment)
+        assert recording.problem() == "" and recording.path == tmp_path / experiment
         recording.sample((1, 1, 1.0, 1, 0.5))
         if complete:
             for name, kind in results.items():
@@ -81,9 +80,9 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
             executor.spin_once(timeout_sec=0.02)
         assert ("no transfer_function and no pi_gains" in closed[0]) is not complete
         assert ("the model was refused" in closed[0]) is not complete
-        recordings.close_all("", 10.0)
-        assert recordings.problem() == ""
-    recordings.begin("alone", str(tmp_path)).close_with_results(0.0, closed.append)
+        recording.join(10.0)
+        assert recording.problem() == ""
+    Recording(node, ends, str(tmp_path), "alone").close_with_results(0.0, closed.append)
     for _ in range(PATIENCE):
         if len(closed) > 1:
             break
@@ -101,9 +100,10 @@ def test_its_path_can_be_typed_in_another_folder(
     monkeypatch.chdir(tmp_path)
     topics = ("measurement", "command")
     ends = {name: node.create_publisher(Float64, name, 10) for name in topics}
-    recordings = Recordings(node, lambda: ends)
-    assert recordings.begin("one", "records").path == tmp_path / "records" / "one"
-    recordings.close_all("", 10.0)
+    recording = Recording(node, ends, "records", "one")
+    assert recording.path == tmp_path / "records" / "one"
+    recording.close("")
+    recording.join(10.0)
 
 
 def test_it_waits_as_long_as_the_identifier_gets_on(
@@ -115,8 +115,7 @@ def test_it_waits_as_long_as_the_identifier_gets_on(
     )
     topics = ("measurement", "command", *RESULTS)
     ends = {name: node.create_publisher(Float64, name, 10) for name in topics}
-    recordings = Recordings(node, lambda: ends)
-    recording = recordings.begin("slow", str(tmp_path))
+    recording = Recording(node, ends, str(tmp_path), "slow")
     closed: list[str] = []
     recording.close_with_results(10.0, closed.append)
     for stage in (*(f"stage {k}" for k in range(20)), *["the last one"] * 5):
@@ -128,7 +127,7 @@ def test_it_waits_as_long_as_the_identifier_gets_on(
     recording.close("")
     (reason,) = closed
     assert "has not got on from the last one for" in reason
-    recordings.close_all("", 10.0)
+    recording.join(10.0)
 
 
 def test_each_line_that_logs_has_one_severity() -> None:
