@@ -134,6 +134,7 @@ class Ready:
     :param policy: how the process will be left.
     :param from_small: True if a given amplitude is not put on at once.
     :param period: of the oscillation in the last tune [s]; NaN: not known.
+    :param takes: how long it takes, for people.
     """
 
     parameters: ExperimentParameters
@@ -141,6 +142,7 @@ class Ready:
     policy: SafePolicy
     from_small: bool
     period: float
+    takes: str
 
     def __str__(self) -> str:
         """Return a sentence on the commands of the tune."""
@@ -201,17 +203,9 @@ class Readiness:
         checks.tell("recording", _recording_in(values["record_directory"]))
         checks.tell("model", _identifier_of(self._node))
         checks.tell("expected", *_expected(parameters, self._sensor.samples, last))
-        checks.tell("time", self.time_of(ready, parameters))
+        interval = self._sensor.samples.interval
+        checks.tell("time", ready.takes if ready else how_long(parameters, interval))
         return None if checks.refusals else ready
-
-    def time_of(self, ready: Ready | None, parameters: ExperimentParameters) -> str:
-        """Say how long a tune takes.
-
-        :param ready: what it will do; None: it cannot start.
-        :param parameters: the experiment's parameters.
-        """
-        small = ready is not None and ready.from_small
-        return how_long(parameters, self._sensor.samples.interval, from_small=small)
 
     def _planned(
         self,
@@ -234,7 +228,8 @@ class Readiness:
         shows_ends = moves_setpoint or self._node.count_publishers("command_feedback") > 0
         from_small = not (shows_ends or parameters.finds_amplitude)
         period = last[1].period if last is not None else math.nan
-        return Ready(parameters, baseline, policy, from_small, period)
+        takes = how_long(parameters, self._sensor.samples.interval, from_small=from_small)
+        return Ready(parameters, baseline, policy, from_small, period, takes)
 
     def _baseline(self, given: float) -> float:
         """Return the command of the operating point [u].

@@ -190,12 +190,11 @@ class RelayNode(ServedNode):
         ready = self._readiness.of(amplitude, checks, self._last_cycle)
         if ready is None:
             return answer_of(checks) if dry_run else self._refuse(checks.refusals[0])
-        takes = self._readiness.time_of(ready, ready.parameters)
         if dry_run:
-            reason = f"a tune could start: {ready}; {takes}"
+            reason = f"a tune could start: {ready}; {ready.takes}"
             return answer_of(checks, accepted=True, reason=reason)
         identity, recorded = self._start(ready, goal)
-        reason = f"{ready}; {recorded}; {takes}"
+        reason = f"{ready}; {recorded}; {ready.takes}"
         self.get_logger().info(f"tune {identity} started: {reason}")
         reason += f"; watch {WATCH.format(self._name)}"
         return StartTune.Response(accepted=True, reason=reason, experiment_id=identity)
