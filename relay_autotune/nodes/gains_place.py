@@ -16,7 +16,6 @@ from typing import Any
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
-from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 
 from relay_autotune.control.controller import Control, is_usable
@@ -26,9 +25,10 @@ from relay_autotune.loop.gains import Controller, Gains
 from relay_autotune.loop.law import LawRate
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.lifetime import STEADY
+from relay_autotune.nodes.lifetime import STEADY, ServedNode
 from relay_autotune.nodes.live_types import CommandMessage
 from relay_autotune.nodes.loop_client import LoopClient
+from relay_autotune.nodes.loop_ends import CommandPublisher
 from relay_autotune.nodes.tables import (
     GAINS,
     MESSAGE_PARAMETERS,
@@ -235,7 +235,7 @@ class RemoteController(_Place):
 
     def __init__(
         self,
-        node: Node,
+        node: ServedNode,
         values: Mapping[str, Any],
         setpoints: CommandMessage,
         disturbed: Callable[[Reason], None],
@@ -249,11 +249,8 @@ class RemoteController(_Place):
         """The last command received [u]; NaN before the first."""
         self.setpoint: float = values["initial_setpoint"]
         """The set-point in force [y]; NaN: not known."""
-        self._setpoints, self._disturbed = setpoints, disturbed
+        self._setpoints, self._disturbed = CommandPublisher(node, setpoints, "setpoint"), disturbed
         self._offset = 0.0
-        # Own set-points that have not come back yet over the topic, where others may publish, too.
-        self._on_the_way: list[float] = []
-        self._publisher = quality.publisher(node, setpoints.kind, "setpoint", quality.COMMAND)
         quality.subscription(node, setpoints.kind, "setpoint", self._on_setpoint, quality.COMMAND)
         base = self.name.rstrip("/")
         # Answers must be handled while the callback that waits for them is still running.
@@ -337,14 +334,14 @@ class RemoteController(_Place):
 
         :raises NotReadyError: with the reason.
         """
-        topic, target = self._publisher.topic_name, self.name
+        topic, target = self._setpoints.topic, self.name
         if math.isnan(self.setpoint):
             raise NotReadyError(
                 f"the set-point of {target} is not known: publish it on {topic}, or give "
                 "initial_setpoint"
             )
         # One subscription is the node's own.
-        if self._publisher.get_subscription_count() < 2:
+        if self._setpoints.publisher.get_subscription_count() < 2:
             raise NotReadyError(Code.NOBODY_TAKES(topic=topic, node=target))
         if math.isnan(self.command):
             raise NotReadyError(Code.NOT_HEARD(node=target))
@@ -354,28 +351,23 @@ class RemoteController(_Place):
         if offset == self._offset:
             return
         self._offset = offset
-        value = self.setpoint + offset
-        self._on_the_way.append(self._setpoints.on_wire(value))
-        self._publisher.publish(self._setpoints.written(value))
+        self._setpoints.send(self.setpoint + offset)
 
     def wait_for_setpoint(self, timeout: Duration) -> None:
         """Wait until the last set-point has arrived.
 
         :param timeout: how long at most.
         """
-        self._publisher.wait_for_all_acked(timeout)
+        self._setpoints.publisher.wait_for_all_acked(timeout)
 
     def _on_setpoint(self, message: Any) -> None:
         try:
-            value = self._setpoints.value(message)
+            value = self._setpoints.messages.value(message)
         except FieldError as error:
             why = f"another node set a set-point that cannot be read: {error}"
             self._disturbed(Code.INTERFERED(sentence=why))
             return
-        if value in self._on_the_way:
-            self._on_the_way.remove(value)
-            return
-        if not is_usable(value):
+        if self._setpoints.is_own(value) or not is_usable(value):
             return
         changed = value != self.setpoint + self._offset
         # The new set-point is in force already, so there is no step to take back.

@@ -33,6 +33,10 @@ REPEAT_SAFE = Duration(seconds=0.01)
 REPEATS = 15
 
 
+# The last numbers that may still be on their way.
+_OWN_KEPT = 256
+
+
 class CommandPublisher:
     """A topic on which numbers go out, each in a message of its own.
 
@@ -52,8 +56,7 @@ class CommandPublisher:
         self.topic: str = self.publisher.topic_name
         # Looked up once, because they are called for each measurement.
         self._written, self._publish = messages.written, self.publisher.publish
-        self.kept: deque[float] | None = None
-        """Gets each number as its receivers read it, before it is published; None: not kept."""
+        self._on_the_way: deque[float] = deque(maxlen=_OWN_KEPT)
         self.last: float | None = None
         """The number published last; None: there was none."""
         self.is_fresh = False
@@ -64,10 +67,19 @@ class CommandPublisher:
         message = self._written(value)
         if message is None:
             return
-        if self.kept is not None:
-            self.kept.append(self.messages.on_wire(value))
+        self._on_the_way.append(self.messages.on_wire(value))
         self._publish(message)
         self.last, self.is_fresh = value, True
+
+    def is_own(self, value: float) -> bool:
+        """Tell whether a number on the topic, where others may publish, is one of these.
+
+        :param value: the number, as a receiver reads it; each of these comes once.
+        """
+        if value not in self._on_the_way:
+            return False
+        self._on_the_way.remove(value)
+        return True
 
 
 # Number of the controller's last commands that are averaged.
@@ -159,8 +171,6 @@ class BumplessTransfer:
         return left * self._offset
 
 
-# In takeover, number of the node's own last commands; they return to it over the topic.
-_OWN_KEPT = 256
 # The graph is looked at each fourth time.
 _OF_GRAPH = 4
 
@@ -227,7 +237,6 @@ class LoopSupervisor:
         kind, often = self._messages.kind, quality.MEASUREMENT
         hears = partial(quality.subscription, node)
         if self._takeover:
-            self._sent = self.command.kept = deque[float](maxlen=_OWN_KEPT)
             hears(kind, "command", self._on_command, quality.COMMAND)
         elif not self._is_reported:
             self._controller = hears(Float64, "controller_command", self._on_controller, often)
@@ -430,7 +439,7 @@ class LoopSupervisor:
         except FieldError as error:
             self._stop(Code.FOREIGN_COMMAND(topic=self._topic, unread=str(error)))
             return
-        if command in self._sent:
+        if self.command.is_own(command):
             return
         if self._experiment is not None:
             must = "hold or track"

@@ -63,7 +63,9 @@ def test_gains_of_another_node_are_predicted_by_its_law_and_its_feed_forward() -
     """A tune told Ms 1.39, and the proof of the same gains by our own law 1.32."""
     nothing = lambda *_, **__: None  # noqa: E731
     node: Any = SimpleNamespace(
-        create_client=nothing, create_publisher=nothing, create_subscription=nothing
+        create_client=nothing,
+        create_publisher=lambda *_, **__: SimpleNamespace(topic_name="/setpoint", publish=nothing),
+        create_subscription=nothing,
     )
     values = {"apply_to": "/pid", "apply_parameters": "p:p,i:i,d:d", "apply_feedforward": 0.8}
     values["initial_setpoint"] = math.nan
