@@ -48,7 +48,8 @@ from relay_autotune.nodes.gains_place import (
 )
 from relay_autotune.nodes.goals import serve
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
-from relay_autotune.nodes.live_types import command_reader, reader_of
+from relay_autotune.nodes.live_types import CommandMessage, command_reader, reader_of
+from relay_autotune.nodes.loop_ends import CommandPublisher
 from relay_autotune.nodes.parameters import ask_before_changes, declare, merged, values_of
 from relay_autotune.nodes.results import ResultCheck
 from relay_autotune.nodes.verifier import Predictors, Verifiable, Verifier
@@ -161,8 +162,6 @@ class ControllerNode(ServedNode):
         self._offset = self._load = 0.0
         # True while this node writes its gains into its own parameters.
         self._following = False
-        self._message = Float64()
-        self._commanded = False
         self._verifier = Verifier(
             self,
             prepare=self._prepare_verification,
@@ -179,7 +178,7 @@ class ControllerNode(ServedNode):
         self._place: Place = self._remote or OwnGains(self._use, self._rate)
         reader = reader_of(values["measurement_type"], values["measurement_field"])
         self._value, self._stamp = reader.value, reader.stamp_ns
-        self._commands = quality.publisher(self, Float64, "controller_command", quality.COMMAND)
+        self._commands = CommandPublisher(self, CommandMessage(), "controller_command")
         self._sensor = Sensor(self, reader, self._on_measurement, self._on_silence)
         measurement = self._sensor.subscription
         self.create_timer(_LOOK_EVERY, self._look, clock=STEADY)
@@ -213,7 +212,7 @@ class ControllerNode(ServedNode):
             self.context.get_domain_id(),
             # The same numbers are other gains under another law.
             " ".join(filter(None, (measurement.topic_name, values["apply_to"], under))),
-            "" if values["apply_to"] else self._commands.topic_name,
+            "" if values["apply_to"] else self._commands.topic,
         )
         given = self._own(gains) if self._remote is None else None
         self._keeper = GainsKeeper(self, self._place, journal, given, self._require_bounds)
@@ -227,7 +226,7 @@ class ControllerNode(ServedNode):
         self.get_logger().info(
             f"ready: {controller_text(self._pid.gains)}, "
             f"{'automatic' if self._pid.is_automatic else 'holding its command'}; "
-            f"commands go to {self._commands.topic_name}, held until somebody subscribes to it; "
+            f"commands go to {self._commands.topic}, held until somebody subscribes to it; "
             f"measurements come on {self.resolve_topic_name('measurement')}, "
             f"set-points on {self.resolve_topic_name('setpoint')}"
         )
@@ -308,18 +307,16 @@ class ControllerNode(ServedNode):
                 # An integral that went on would be a jump for whoever takes the commands later.
                 self._pid.track(self._pid.command)
             command = self._pid.step(at, self._setpoint + self._offset, value)
-            self._message.data = self._settings.limits.clip(command + self._load)
-            self._commands.publish(self._message)
-            self._commanded = True
+            self._commands.send(self._settings.limits.clip(command + self._load))
         if math.isfinite(value) and math.isfinite(command):
             self._verifier.sample(at, value, command)
 
     def _is_untaken(self) -> bool:
         """Tell whether nobody subscribes to the commands, and log where that has changed."""
-        untaken = self._commands.get_subscription_count() == 0
+        untaken = self._commands.publisher.get_subscription_count() == 0
         if untaken is not self._untaken:
             self._untaken = untaken
-            topic, held = self._commands.topic_name, self._pid.command
+            topic, held = self._commands.topic, self._pid.command
             if untaken:
                 self._verifier.interrupt(Code.NOBODY_SUBSCRIBES(topic=topic, since="any more"))
                 self.get_logger().warning(
@@ -527,7 +524,7 @@ class ControllerNode(ServedNode):
             raise NotReadyError(Code.TUNING())
         self._predictors.require_any()
         if self._remote is None and self._untaken:
-            raise NotReadyError(Code.NOBODY_SUBSCRIBES(topic=self._commands.topic_name))
+            raise NotReadyError(Code.NOBODY_SUBSCRIBES(topic=self._commands.topic))
         if self._remote is not None:
             self._remote.require_ready()
         if why := self._verifier.why_silent():
@@ -594,13 +591,12 @@ class ControllerNode(ServedNode):
         self._verifier.interrupt(reason)
         if self._remote is not None:
             self._remote.wait_for_setpoint(ACKNOWLEDGE)
-        elif self._commanded and not self._held:
+        elif self._commands.last is not None and not self._held:
             given = self.get_parameter("safe_command").value
             last = self._pid.command if math.isnan(rested) else rested
             safe = self._settings.limits.clip(last if math.isnan(given) else given)
-            self._message.data = safe
-            self._commands.publish(self._message)
-            self._commands.wait_for_all_acked(ACKNOWLEDGE)
+            self._commands.send(safe)
+            self._commands.publisher.wait_for_all_acked(ACKNOWLEDGE)
             self.get_logger().info(f"{reason}; the command is left at {safe:g}")
         if at_work:
             self._undo()
