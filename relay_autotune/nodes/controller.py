@@ -173,8 +173,7 @@ class ControllerNode(ServedNode):
         self._remote: RemoteController | None = None
         setpoints, self._reported = setpoint_message(values), command_reader(values)
         if values["apply_to"]:
-            interrupt = self._verifier.interrupt
-            self._remote = RemoteController(self, values, setpoints, interrupt)
+            self._remote = RemoteController(self, values, setpoints, self._verifier.disturb)
         self._place: Place = self._remote or OwnGains(self._use, self._rate)
         reader = reader_of(values["measurement_type"], values["measurement_field"])
         self._value, self._stamp = reader.value, reader.stamp_ns
@@ -345,8 +344,7 @@ class ControllerNode(ServedNode):
             )
             return
         if value != self._setpoint:
-            why = f"the set-point was changed to {value:g} by another node"
-            self._verifier.interrupt(Code.INTERFERED(sentence=why))
+            self._verifier.disturb(f"the set-point was changed to {value:g} by another node")
         self._setpoint = value
 
     def _hear(self, command: float) -> None:
@@ -374,13 +372,12 @@ class ControllerNode(ServedNode):
         self._held, why = message.data, "a tune has begun"
         if self._held:
             self._verifier.commands.forget()
-            self._verifier.interrupt(Code.INTERFERED(sentence=why))
+            self._verifier.disturb(why)
         self.get_logger().info(why if self._held else "the tune has ended")
 
     def _switch(self, request: SetBool.Request) -> str:
         if not request.data:
-            why = "the controller was switched to manual"
-            self._verifier.interrupt(Code.INTERFERED(sentence=why))
+            self._verifier.disturb("the controller was switched to manual")
         before = self._pid.is_automatic
         self._pid.switch(automatic=request.data)
         if self._pid.is_automatic != request.data:
@@ -590,7 +587,7 @@ class ControllerNode(ServedNode):
         self._ending = True
         self._verifier.interrupt(reason)
         if self._remote is not None:
-            self._remote.wait_for_setpoint(ACKNOWLEDGE)
+            self._remote.setpoints.publisher.wait_for_all_acked(ACKNOWLEDGE)
         elif self._commands.last is not None and not self._held:
             given = self.get_parameter("safe_command").value
             last = self._pid.command if math.isnan(rested) else rested

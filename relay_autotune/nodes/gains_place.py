@@ -15,7 +15,6 @@ from typing import Any
 
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.duration import Duration
 from rclpy.parameter import Parameter, parameter_value_to_python
 
 from relay_autotune.control.controller import Control, is_usable
@@ -36,7 +35,7 @@ from relay_autotune.nodes.tables import (
     parameters_of_law,
     rate_of,
 )
-from relay_autotune.reasons import Code, Reason
+from relay_autotune.reasons import Code
 
 # Names of the gains that may be sent, of the ISA and of the parallel form, and the time constant
 # of a back-calculation, which belongs to them.
@@ -228,7 +227,7 @@ class RemoteController(_Place):
     :param node: this node.
     :param values: the parameters of controller_node.
     :param setpoints: writes a set-point into its message.
-    :param disturbed: called with the reason when a third node moves the set-point.
+    :param disturbed: called with a sentence when a third node moves the set-point.
     """
 
     outlives = True
@@ -238,7 +237,7 @@ class RemoteController(_Place):
         node: ServedNode,
         values: Mapping[str, Any],
         setpoints: CommandMessage,
-        disturbed: Callable[[Reason], None],
+        disturbed: Callable[[str], None],
     ) -> None:
         # Its law is known with the first gains that are for it.
         super().__init__(values["apply_to"], mapping_of(values["apply_parameters"]), None)
@@ -249,8 +248,9 @@ class RemoteController(_Place):
         """The last command received [u]; NaN before the first."""
         self.setpoint: float = values["initial_setpoint"]
         """The set-point in force [y]; NaN: not known."""
-        self._setpoints, self._disturbed = CommandPublisher(node, setpoints, "setpoint"), disturbed
-        self._offset = 0.0
+        self.setpoints = CommandPublisher(node, setpoints, "setpoint")
+        """Where its set-points go out."""
+        self._disturbed, self._offset = disturbed, 0.0
         quality.subscription(node, setpoints.kind, "setpoint", self._on_setpoint, quality.COMMAND)
         base = self.name.rstrip("/")
         # Answers must be handled while the callback that waits for them is still running.
@@ -334,14 +334,14 @@ class RemoteController(_Place):
 
         :raises NotReadyError: with the reason.
         """
-        topic, target = self._setpoints.topic, self.name
+        topic, target = self.setpoints.topic, self.name
         if math.isnan(self.setpoint):
             raise NotReadyError(
                 f"the set-point of {target} is not known: publish it on {topic}, or give "
                 "initial_setpoint"
             )
         # One subscription is the node's own.
-        if self._setpoints.publisher.get_subscription_count() < 2:
+        if self.setpoints.publisher.get_subscription_count() < 2:
             raise NotReadyError(Code.NOBODY_TAKES(topic=topic, node=target))
         if math.isnan(self.command):
             raise NotReadyError(Code.NOT_HEARD(node=target))
@@ -351,30 +351,21 @@ class RemoteController(_Place):
         if offset == self._offset:
             return
         self._offset = offset
-        self._setpoints.send(self.setpoint + offset)
-
-    def wait_for_setpoint(self, timeout: Duration) -> None:
-        """Wait until the last set-point has arrived.
-
-        :param timeout: how long at most.
-        """
-        self._setpoints.publisher.wait_for_all_acked(timeout)
+        self.setpoints.send(self.setpoint + offset)
 
     def _on_setpoint(self, message: Any) -> None:
         try:
-            value = self._setpoints.messages.value(message)
+            value = self.setpoints.messages.value(message)
         except FieldError as error:
-            why = f"another node set a set-point that cannot be read: {error}"
-            self._disturbed(Code.INTERFERED(sentence=why))
+            self._disturbed(f"another node set a set-point that cannot be read: {error}")
             return
-        if self._setpoints.is_own(value) or not is_usable(value):
+        if self.setpoints.is_own(value) or not is_usable(value):
             return
         changed = value != self.setpoint + self._offset
         # The new set-point is in force already, so there is no step to take back.
         self.setpoint, self._offset = value, 0.0
         if changed:
-            why = f"another node set the set-point to {value:g}"
-            self._disturbed(Code.INTERFERED(sentence=why))
+            self._disturbed(f"another node set the set-point to {value:g}")
 
 
 Place = OwnGains | RemoteController

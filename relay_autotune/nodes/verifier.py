@@ -609,6 +609,10 @@ class Verifier:
         """End the verification without a verdict."""
         self._end(None, why)
 
+    def disturb(self, sentence: str) -> None:
+        """End the verification without a verdict, since somebody else has changed the loop."""
+        self.interrupt(Code.INTERFERED(sentence=sentence))
+
     def look(self) -> None:
         """End a proof that takes too long, or whose loop is silent; to be called often."""
         self._wake_up()
