@@ -319,7 +319,8 @@ class GainsClient(LoopClient):
                 found[key] = message
             return len(found) == len(stamps)
 
-        self.latched(Verification, "verification", take, _RESULT_WITHIN)
+        if stamps:
+            self.latched(Verification, "verification", take, _RESULT_WITHIN)
         return [found[key] for key in stamps if key in found]
 
     def let_settle(

@@ -410,6 +410,12 @@ def test_gains_that_are_on_their_way_to_the_node_are_no_reason_to_be_told() -> N
     assert told == [f"waiting: {Code.NO_CLOCK()}"]
 
 
+def test_a_proof_that_has_made_no_step_is_not_waited_for() -> None:
+    client: Any = GainsClient.__new__(GainsClient)
+    client.latched = lambda *_: pytest.fail("it would wait for 5 s")
+    assert client.steps_of(Verify.Result()) == []
+
+
 def test_new_gains_that_could_not_be_taken_back_are_told_as_such(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
