@@ -63,13 +63,14 @@ def reader_of(type_name: str, field: str, parameter: str = "measurement_field") 
     :raises ParameterError: if the type does not exist, or the field is not a number.
     """
     kind = message_class(type_name, "measurement_type")
+    struct = struct_of(kind)
     try:
-        steps = steps_of(struct_of(kind), field, type_name)
+        steps = steps_of(struct, field, struct.name)
     except FieldError as error:
         raise ParameterError(f"{parameter}: {error}") from None
     stamped = hasattr(kind(), "header")
     stamp = (lambda message: stamp_nanoseconds(message.header.stamp)) if stamped else None
-    return Reader(kind, type_name, reading(steps), stamp)
+    return Reader(kind, struct.name, reading(steps), stamp)
 
 
 def command_reader(values: Mapping[str, Any]) -> Callable[[Any], float] | None:
@@ -155,18 +156,19 @@ class CommandMessage:
                 "source of the other elements"
             )
         self.kind = message_class(type_name, "command_type")
-        self.type_name = type_name
         root, message = struct_of(self.kind), self.kind()
+        # As the graph calls it: std_msgs/Float64 is a name of this type, too.
+        self.type_name = root.name
         _fill(message, _mapping(given), "")
         self.field = self._only_element(root, field, message, taken=taken)
         try:
-            steps = steps_of(root, self.field, type_name)
+            steps = steps_of(root, self.field, root.name)
         except FieldError as error:
             raise ParameterError(f"command_field: {error}") from None
         number = _number_of(root, steps)
         if number.form not in "fd":
             raise ParameterError(
-                f"command_field: {self.field} of {type_name} is a {number.name}; expected a "
+                f"command_field: {self.field} of {root.name} is a {number.name}; expected a "
                 f"float32 or float64, which can hold the relay's levels"
             )
         self._is_single = number.form == "f"

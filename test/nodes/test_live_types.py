@@ -17,7 +17,12 @@ from std_msgs.msg import Byte, Float64
 from relay_autotune.bag.definitions import Channel, find_definition, message_type
 from relay_autotune.errors import FieldError, ParameterError
 from relay_autotune.nodes import gains_place
-from relay_autotune.nodes.live_types import command_reader, reader_of, struct_of
+from relay_autotune.nodes.live_types import (
+    CommandMessage,
+    command_reader,
+    reader_of,
+    struct_of,
+)
 from relay_autotune.nodes.relay import require_reported
 from relay_autotune.nodes.tables import CONTROLLER_PARAMETERS
 
@@ -74,6 +79,12 @@ def test_numbers_of_other_kinds() -> None:
 def test_fields_that_are_none_are_refused_when_the_node_starts(field: str, sentence: str) -> None:
     with pytest.raises(ParameterError, match=f"measurement_field: .*{sentence}"):
         reader_of("sensor_msgs/msg/JointState", field)
+
+
+def test_a_type_is_called_as_the_graph_calls_it_however_it_was_typed() -> None:
+    """The type that was typed was compared with that of publishers, and with a table."""
+    assert reader_of("std_msgs/Float64", "data").type_name == "std_msgs/msg/Float64"
+    assert CommandMessage("std_msgs/Float64").type_name == "std_msgs/msg/Float64"
 
 
 def test_a_type_that_is_not_installed_is_refused() -> None:
