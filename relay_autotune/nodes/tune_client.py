@@ -253,8 +253,9 @@ class TuneClient(LoopClient):
         :param cycle: called with each `RelayCycle`.
         :raises LoopError: unless exactly one topic can be it.
         """
-        kind, field = self.values(self.name, ["command_type", "command_field"]).values()
-        commands = CommandMessage(kind, field, "", taken=True, now_ns=time.time_ns)
+        names = ("command_type", "command_field", "command_message", "command_others")
+        *given, others = self.values(self.name, names).values()
+        commands = CommandMessage(*given, taken=others == "other_commands")
         name = self._topic_of(self.name, "command", commands.type_name, published=True)
         hear = readable(commands.value, take)
 

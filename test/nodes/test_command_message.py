@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 from types import ModuleType
 from typing import Any, ClassVar
 
@@ -17,6 +18,9 @@ from std_msgs.msg import Float32, Float64MultiArray
 
 from relay_autotune.errors import ParameterError
 from relay_autotune.nodes.live_types import CommandMessage
+from relay_autotune.nodes.tune_client import TuneClient
+
+NAMES = ("command_type", "command_field", "command_message", "command_others")
 
 MULTI, DOUBLES = "std_msgs/msg/Float64MultiArray", "control_msgs/msg/MultiDOFCommand"
 STAMP = 1_790_000_000_123_456_789
@@ -140,6 +144,31 @@ def test_what_cannot_be_commanded_is_refused(
 ) -> None:
     with pytest.raises(ParameterError, match=sentence):
         commands(type_name, field, given)
+
+
+@pytest.mark.parametrize(
+    ("field", "message", "others", "sent"),
+    [
+        ("data", "", "command_message", [2.5]),
+        ("data[1]", "{data: [0.0, 1.0]}", "command_message", [0.0, 2.5]),
+        ("data[2]", "", "other_commands", [0.0, 1.0, 2.5]),
+    ],
+)
+def test_commands_are_heard_as_the_node_sends_them(
+    field: str, message: str, others: str, sent: list[float]
+) -> None:
+    """A page said of the only element of an array that it is one of several."""
+    client: Any = TuneClient.__new__(TuneClient)
+    kind = "std_msgs/msg/Float64MultiArray"
+    given = dict(zip(NAMES, (kind, field, message, others), strict=True))
+    client.name, client.values = "/relay_node", lambda _, names: {n: given[n] for n in names}
+    client._topic_of = lambda *_, **__: "/commands"
+    hears: list[Any] = []
+    client._hearing = lambda _kind, _topic, take: hears.append(take) or nullcontext()
+    heard: list[float] = []
+    with client.command_watch(heard.append, print)():
+        hears[0](Float64MultiArray(data=sent))
+    assert heard == [2.5]
 
 
 def test_two_sources_of_the_others_are_refused() -> None:
