@@ -203,23 +203,21 @@ class IdentifierNode(ServedNode):
     def _of_running(self) -> _Fit | None:
         """Return the fit of the running experiment, None if there is nothing new."""
         progress, self._progress = self._progress, None
-        try:
-            if progress is not None and progress.experiment_id != self._ended:
+        fit: _Fit | None = None
+        if progress is not None and progress.experiment_id != self._ended:
+            with self._refusals.saying("the progress", progress.experiment_id):
                 record = record_from_message(progress)
                 # The quantity whose interval ends the experiment, and the wanted width.
                 sought = progress.sought or ULTIMATE_GAIN, progress.sought_width
                 work = partial(self._running_fit.fit, record, self._task(), *sought)
-                return work, partial(self._fitted, record.experiment_id)
-            new, self._cycles_are_new = self._cycles_are_new, False
-            if new and self._cycles:
+                fit = work, partial(self._fitted, record.experiment_id)
+        elif self._cycles_are_new and self._cycles:
+            self._cycles_are_new = False
+            with self._refusals.saying("the cycles", self._cycles_of):
                 record = record_from_cycles(self._cycles.values())
                 work = partial(model_so_far, record, self._task())
-                return work, partial(self._fitted, record.experiment_id)
-        except RelayAutotuneError as error:
-            what = "the cycles" if progress is None else "the progress"
-            name = self._cycles_of if progress is None else progress.experiment_id
-            self._refusals.say(what, name, error)
-        return None
+                fit = work, partial(self._fitted, record.experiment_id)
+        return fit
 
     def _whole(self, record: Record) -> Callable[[], Analysis]:
         """Return the function that analyses the record of a finished experiment."""

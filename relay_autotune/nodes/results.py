@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +37,7 @@ from relay_autotune.loop.gains import Gains
 from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import Outcome, Record
+from relay_autotune.record.record import Outcome
 
 if TYPE_CHECKING:
     from relay_autotune.nodes.session import Session
@@ -139,6 +140,14 @@ class Refusals:
         self.last = ""
         """The last refusal as a sentence, whether it was logged or not."""
 
+    @contextmanager
+    def saying(self, what: str, experiment_id: str) -> Iterator[None]:
+        """Log what is refused in the block, which ends there; see :meth:`say`."""
+        try:
+            yield
+        except RelayAutotuneError as error:
+            self.say(what, experiment_id, error)
+
     def say(self, what: str, experiment_id: str, error: RelayAutotuneError) -> None:
         """Log a refusal, unless this cause was logged before.
 
@@ -176,23 +185,17 @@ class ResultCheck:
         self.models: dict[str, tuple[TransferFunction, str]] = {}
         """The final models by experiment, the newest last, each with the reason to doubt it."""
 
-    def know(self, experiment: Record) -> None:
-        """Remember the facts of a record; a later record with the same id changes nothing.
-
-        :param experiment: its record.
-        """
-        if experiment.experiment_id not in self._evidence:
-            keep(self._evidence, experiment.experiment_id, ExperimentFacts.of(experiment))
-
     def experiment(self, message: Any) -> None:
         """Remember the facts of an experiment's record, if the message holds a valid one.
 
+        A later record with the same id changes nothing.
+
         :param message: the `RelayExperiment`.
         """
-        try:
-            self.know(record_from_message(message))
-        except RelayAutotuneError as error:
-            self.refusals.say("the record", message.experiment_id, error)
+        with self.refusals.saying("the record", message.experiment_id):
+            record = record_from_message(message)
+            if record.experiment_id not in self._evidence:
+                keep(self._evidence, record.experiment_id, ExperimentFacts.of(record))
 
     def model(self, message: Any) -> TransferFunction | None:
         """Return the model in a message, None if it is refused.
@@ -288,51 +291,42 @@ class OwnResults(ResultCheck):
         :param on_setpoint: True if the relay moves a set-point, so that its levels and its sign
             are not those of the command.
         """
-        experiment_id = message.experiment_id
-        if running is not None:
-            why = self._why_not_running(name, message, running, on_setpoint)
-            if why is not None:
-                self.refusals.say("the model" if name == MODEL else "gains", experiment_id, why)
-                return []
-        if name == MODEL:
-            if self.model(message) is None:
-                return []
-            found, early = [(name, message)], self._early
-            if early is not None and message.final:
-                self._early = None
-                found += self.take(early[0], early[1], running, on_setpoint)
-            return found
-        if message.final and experiment_id in self._evidence and experiment_id not in self.models:
-            self._early = name, message
-            return []
-        try:
-            self.gains(message)
-        except RelayAutotuneError as error:
-            self.refusals.say("gains", experiment_id, error)
-            return []
-        return [(name, message)]
+        of = message.experiment_id
+        found: list[tuple[str, Any]] = []
+        with self.refusals.saying("the model" if name == MODEL else "gains", of):
+            if running is not None:
+                self._require_possible(name, message, running, on_setpoint)
+            if name == MODEL:
+                if self.model(message) is not None:
+                    found.append((name, message))
+                    if (early := self._early) is not None and message.final:
+                        self._early = None
+                        found += self.take(*early, running, on_setpoint)
+            elif message.final and of in self._evidence and of not in self.models:
+                self._early = name, message
+            else:
+                self.gains(message)
+                found.append((name, message))
+        return found
 
-    def _why_not_running(
+    def _require_possible(
         self, name: str, message: Any, running: Session, on_setpoint: bool
-    ) -> RelayAutotuneError | None:
+    ) -> None:
+        """Refuse what cannot be said of an experiment that still runs."""
         if name != MODEL or message.final:
-            return TuningError(_TOO_SOON)
+            raise TuningError(_TOO_SOON)
         experiment = running.experiment
         sign, amplitude, relay = experiment.facts.sign, math.nan, math.nan
         cycles, settings = experiment.cycles, experiment.settings
-        try:
-            facts, swing = self._facts_so_far(running)
-            if on_setpoint:
-                sign = 0
-            elif settings is not None:
-                amplitude = cycles[-1].amplitude if cycles else 0.5 * swing
-                relay = settings.amplitude
-            found = finding_from_message(message)
-            check_finding(found, sign=sign, amplitude=amplitude, relay=relay)
-            facts.check_model(transfer_function_from_message(message))
-        except RelayAutotuneError as error:
-            return error
-        return None
+        facts, swing = self._facts_so_far(running)
+        if on_setpoint:
+            sign = 0
+        elif settings is not None:
+            amplitude = cycles[-1].amplitude if cycles else 0.5 * swing
+            relay = settings.amplitude
+        found = finding_from_message(message)
+        check_finding(found, sign=sign, amplitude=amplitude, relay=relay)
+        facts.check_model(transfer_function_from_message(message))
 
     def _facts_so_far(self, running: Session) -> tuple[ExperimentFacts, float]:
         """Return what is known of a running experiment, and its swing [y].
