@@ -23,7 +23,7 @@ from relay_autotune.cli.own_nodes import START_WITHIN
 from relay_autotune.cli.settings import SETTING
 from relay_autotune.cli.terminal import UNITS, WIDEST, Working
 from relay_autotune.cli.tune_view import Paint, result_lines
-from relay_autotune.control.controller import Control
+from relay_autotune.control.controller import Control, PredictedLoop
 from relay_autotune.control.step_choice import StepChoice, StepRange
 from relay_autotune.control.verification import RUNAWAY, SETTLES, noise_of
 from relay_autotune.errors import TuningError
@@ -170,8 +170,8 @@ class Proof:
         noise_std = noise_of(record.noise_std, result.transfer_function.residual_rms)
         model = transfer_function_from_message(result.transfer_function)
         self.rate = rate_of(gains.law, gains.law_period)
-        control = Control(gains, self.rate)
-        self._choice = choice = StepChoice(record, model, control, *limits, noise_std)
+        predicted = PredictedLoop(Control(gains, self.rate), model)
+        self._choice = choice = StepChoice(record, predicted, *limits, noise_std)
         if not (step := options.step or choice.best):
             raise TuningError("the limits leave no room for a step: widen --within")
         self.step: float = options.step or choice.allowed.nearest(step)

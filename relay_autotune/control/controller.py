@@ -301,48 +301,64 @@ class Step:
     load_time: float = 0.0
 
 
-def run_loop(
-    control: Control,
-    model: TransferFunction,
-    time: FloatArray,
-    step: Step,
-    *,
-    limits: Limits = UNLIMITED,
-    noise: FloatArray | None = None,
-) -> ClosedLoop:
-    """Simulate a controller on the exact process, from rest, after steps of set-point and load.
+@dataclass(frozen=True)
+class PredictedLoop:
+    """A controller on a process as it was identified.
 
     :param control: the controller.
     :param model: the process.
-    :param time: instants of the samples [s], increasing, the first at the step, shape (n,).
-    :param step: what moves it.
-    :param limits: range of the command, as deviations [u].
-    :param noise: on the measurement at each run of the controller [y], shape (n,); None: none.
     """
-    plant, samples = Plant(model), time - time[0]
-    controller = running(control.rate, control.gains, 0.0, limits=limits)
-    interval = float(np.median(np.diff(time))) if time.size > 1 else 1.0
-    runs, until = samples, np.arange(1, time.size + 1)
-    if control.elsewhere and control.rate is not None:
-        # Its runs go on where a sample is lost, and between the samples of a slow sensor.
-        interval = control.rate.period
-        runs = interval * np.arange(int(samples[-1] / interval) + 1)
-        until = np.searchsorted(runs, samples, side="right")
-    seen = np.zeros(runs.size) if noise is None else noise
-    controller.step(-interval, 0.0, 0.0)
-    measurement, command = np.empty(time.size), np.empty(time.size)
-    done, applied, y = 0, 0.0, 0.0
-    for k, t in enumerate(samples):
-        for n in range(done, until[k]):
-            run = float(runs[n])
-            y = plant.advance(run, applied)
-            applied = controller.step(run, step.setpoint, float(y + seen[n]))
-            applied += step.load if run + interval > step.load_time else 0.0
-        done = until[k]
-        if runs[done - 1] != t:
-            y = plant.advance(float(t), applied)
-        measurement[k], command[k] = y, controller.command
-    return ClosedLoop(time, measurement, command)
+
+    control: Control
+    model: TransferFunction
+
+    def with_gain(self, factor: float) -> PredictedLoop:
+        """Return the loop with a process of another gain.
+
+        :param factor: on the gain of the process.
+        """
+        return replace(self, model=replace(self.model, gain=factor * self.model.gain))
+
+    def run(
+        self,
+        time: FloatArray,
+        step: Step,
+        *,
+        limits: Limits = UNLIMITED,
+        noise: FloatArray | None = None,
+    ) -> ClosedLoop:
+        """Simulate the loop, exact between samples, from rest, after steps of set-point and load.
+
+        :param time: instants of the samples [s], increasing, the first at the step, shape (n,).
+        :param step: what moves it.
+        :param limits: range of the command, as deviations [u].
+        :param noise: on the measurement at each run of the controller [y], shape (n,); None: none.
+        """
+        plant, samples = Plant(self.model), time - time[0]
+        control = self.control
+        controller = running(control.rate, control.gains, 0.0, limits=limits)
+        interval = float(np.median(np.diff(time))) if time.size > 1 else 1.0
+        runs, until = samples, np.arange(1, time.size + 1)
+        if control.elsewhere and control.rate is not None:
+            # Its runs go on where a sample is lost, and between the samples of a slow sensor.
+            interval = control.rate.period
+            runs = interval * np.arange(int(samples[-1] / interval) + 1)
+            until = np.searchsorted(runs, samples, side="right")
+        seen = np.zeros(runs.size) if noise is None else noise
+        controller.step(-interval, 0.0, 0.0)
+        measurement, command = np.empty(time.size), np.empty(time.size)
+        done, applied, y = 0, 0.0, 0.0
+        for k, t in enumerate(samples):
+            for n in range(done, until[k]):
+                run = float(runs[n])
+                y = plant.advance(run, applied)
+                applied = controller.step(run, step.setpoint, float(y + seen[n]))
+                applied += step.load if run + interval > step.load_time else 0.0
+            done = until[k]
+            if runs[done - 1] != t:
+                y = plant.advance(float(t), applied)
+            measurement[k], command[k] = y, controller.command
+        return ClosedLoop(time, measurement, command)
 
 
 def simulate_closed_loop(
@@ -386,20 +402,5 @@ def simulate_closed_loop(
         else Control(controller.gains, LawRate(controller.law, period))
     )
     time = np.arange(int(duration / period) + 1, dtype=np.float64) * period
-    return run_loop(
-        control,
-        model,
-        time,
-        Step(setpoint, load, load_time),
-        limits=Limits(low, high),
-        noise=noise,
-    )
-
-
-def scaled(model: TransferFunction, factor: float) -> TransferFunction:
-    """Return a model with another gain.
-
-    :param model: the process.
-    :param factor: factor on its gain.
-    """
-    return replace(model, gain=factor * model.gain)
+    step = Step(setpoint, load, load_time)
+    return PredictedLoop(control, model).run(time, step, limits=Limits(low, high), noise=noise)

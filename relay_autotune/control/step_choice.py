@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from relay_autotune.control.controller import Control, Step
+from relay_autotune.control.controller import PredictedLoop, Step
 from relay_autotune.control.verification import (
     NOISE_ALLOWANCE,
     Plan,
@@ -25,7 +25,6 @@ from relay_autotune.loop.gains import Gains
 from relay_autotune.loop.law import LawRate
 from relay_autotune.loop.laws import LAWS, OWN_LAW
 from relay_autotune.loop.sampled import Limits
-from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.record import Record
 
 # The step that proves most: multiples of the tune's swing and of the noise, whichever is larger;
@@ -93,16 +92,14 @@ class StepChoice:
 
     :param record: of the tune, with its settings; the loop rests about its set-point and mean
         command.
-    :param model: the process.
-    :param control: the gains, and what runs them.
+    :param loop: the gains, what runs them, and the process.
     :param measurement: its range [y].
     :param command: its range [u].
     :param noise_std: of :func:`noise_of` [y].
     """
 
     record: Record
-    model: TransferFunction
-    control: Control
+    loop: PredictedLoop
     measurement: Limits
     command: Limits
     noise_std: float
@@ -138,7 +135,7 @@ class StepChoice:
 
         :raises TuningError: as :func:`plan`.
         """
-        return plan(self.control, self.model, Step(setpoint=1.0), self.record.mean_interval)
+        return plan(self.loop, Step(setpoint=1.0), self.record.mean_interval)
 
     @property
     def lasts(self) -> float:
@@ -151,7 +148,7 @@ class StepChoice:
 
         NaN in the design: as long as a step is observed; 0: the gains are in force already.
         """
-        if not isinstance(gains := self.control.gains, Gains):
+        if not isinstance(gains := self.loop.control.gains, Gains):
             return 0.0
         return gains.settling_time if math.isfinite(gains.settling_time) else self.lasts
 
@@ -189,13 +186,14 @@ class StepChoice:
     @property
     def _noise_gain(self) -> float:
         """Standard deviation of the command over that of the noise [u/y]."""
-        rate = self.control.rate or LawRate(LAWS[OWN_LAW], self.record.mean_interval)
-        return Loop(rate.of(self.control.gains), self.model).noise_gain()
+        control = self.loop.control
+        rate = control.rate or LawRate(LAWS[OWN_LAW], self.record.mean_interval)
+        return Loop(rate.of(control.gains), self.loop.model).noise_gain()
 
     @property
     def _ways(self) -> tuple[float, float]:
         """How far below and above its set-point the loop can rest [y]."""
-        record, model = self.record, self.model
+        record, model = self.record, self.loop.model
         assert record.settings is not None
         setpoint = record.settings.setpoint
         down, up = setpoint - self.measurement.low, self.measurement.high - setpoint

@@ -13,11 +13,10 @@ import numpy as np
 from scipy.special import ndtr
 
 from relay_autotune.arrays import FloatArray
-from relay_autotune.control.controller import Control, Step, run_loop, scaled
+from relay_autotune.control.controller import PredictedLoop, Step
 from relay_autotune.errors import TuningError
 from relay_autotune.loop.analysis import Loop, is_stable
 from relay_autotune.loop.sampled import UNLIMITED, Limits
-from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.reasons import Code, Reason
 from relay_autotune.scalar import minimum_near, root
 
@@ -171,17 +170,10 @@ def rounded(value: float, whole: Callable[[float], int] = math.ceil) -> float:
     return float(f"{whole(round(value / unit, 7)) * unit:.2g}")
 
 
-def plan(
-    control: Control,
-    model: TransferFunction,
-    step: Step,
-    period: float,
-    noise_std: float = 0.0,
-) -> Plan:
+def plan(loop: PredictedLoop, step: Step, period: float, noise_std: float = 0.0) -> Plan:
     """Return how long a step must be observed, and when to stop it.
 
-    :param control: the controller.
-    :param model: the process.
+    :param loop: controller and process.
     :param step: the step.
     :param period: sample period of the loop [s].
     :param noise_std: standard deviation of the measurement noise [y].
@@ -189,6 +181,7 @@ def plan(
         samples than the law that they run.
     """
     # Another program does not wait for the samples.
+    control = loop.control
     rate = None if control.elsewhere else control.rate
     if rate is not None and period > _SLOWER_SENSOR * rate.period:
         raise TuningError(
@@ -196,16 +189,16 @@ def plan(
             f"{rate.period:.3g} s: these gains can only be proven in their own program; design "
             f"them for the sensor, with a sampling period of {period:.3g} s"
         )
-    if not is_stable(control.law, model):
+    if not is_stable(control.law, loop.model):
         raise TuningError("these gains make an unstable loop with the model: nothing to verify")
-    horizon = max(8.0 * (control.gains.ti + model.dead_time), LEAST_SAMPLES * period)
+    horizon = max(8.0 * (control.gains.ti + loop.model.dead_time), LEAST_SAMPLES * period)
     for _ in range(_DOUBLINGS):
         # Predict a slow loop with fewer samples, to save time.
         interval = max(period, horizon / _PREDICTED_SAMPLES)
         if rate is not None:
             interval = max(period, min(interval, rate.period))
         time = np.arange(int(horizon / interval) + 2, dtype=np.float64) * interval
-        run = run_loop(control, model, time, step)
+        run = loop.run(time, step)
         response = describe(time, run.measurement, step)
         if response.settling_time < 0.6 * horizon:
             duration = max(WATCHED * response.settling_time, LEAST_SAMPLES * period)
@@ -213,19 +206,14 @@ def plan(
             low, high, last = run.command.min(), run.command.max(), run.command[-1]
             command = float(min(low, last - high, 0.0)), float(max(high, last - low, 0.0))
             watched = time[time <= duration]
-            visible = _visible(control, model, step, watched, period, run.measurement)
+            visible = _visible(loop, step, watched, period, run.measurement)
             return Plan(duration, runaway, response.largest, command, visible)
         horizon *= 2.0
     raise TuningError("the predicted response does not settle in any reasonable time")
 
 
 def _visible(
-    control: Control,
-    model: TransferFunction,
-    step: Step,
-    time: FloatArray,
-    period: float,
-    predicted: FloatArray,
+    loop: PredictedLoop, step: Step, time: FloatArray, period: float, predicted: FloatArray
 ) -> float:
     """Return the least height of a step with noise of standard deviation 1 [y, of a load u].
 
@@ -235,8 +223,7 @@ def _visible(
     should have settled; that the sum of absolute errors, or the fitted gain, is beyond its limit,
     to which also belongs the gain that makes Ms too large.
 
-    :param control: the controller.
-    :param model: the process.
+    :param loop: controller and process.
     :param step: the step.
     :param time: instants of the prediction until the end of the step [s], shape (n,).
     :param period: sample period of the loop [s].
@@ -245,7 +232,7 @@ def _visible(
     deviation = predicted[: time.size]
     expected = describe(time, deviation, step)
     scale = step.setpoint or expected.largest
-    other = run_loop(control, scaled(model, _SLIGHTLY), time, step).measurement
+    other = loop.with_gain(_SLIGHTLY).run(time, step).measurement
     slope = float(np.sum(((other - deviation) / math.log(_SLIGHTLY) / scale) ** 2))
     interval = float(np.median(np.diff(time)))
     # Samples for each instant of the prediction.
@@ -254,7 +241,7 @@ def _visible(
     beyond = _beyond(deviation, step, expected.largest)
     limit = SETTLING_RATIO * expected.settling_time + 2.0 * period
     late = (time + interval > limit) | (time >= time[-1] - interval)
-    edges = [_edge(control, model, math.log(end)) for end in GAIN_RANGE]
+    edges = [_edge(loop, math.log(end)) for end in GAIN_RANGE]
     nodes, weights = np.polynomial.hermite_e.hermegauss(_NODES)
     weights = weights / weights.sum()
     floor = math.sqrt(2.0 / math.pi)
@@ -282,17 +269,16 @@ def _visible(
     return height / (abs(scale) * most)
 
 
-def _edge(control: Control, model: TransferFunction, end: float) -> float:
+def _edge(loop: PredictedLoop, end: float) -> float:
     """Return how far the logarithm of the process gain may go to an end until Ms is too large.
 
-    :param control: the controller.
-    :param model: the process.
+    :param loop: controller and process.
     :param end: where the gain is itself too far from the model's.
     """
-    most = MS_RATIO * _ms(control, model)
+    most = MS_RATIO * _ms(loop)
 
     def is_within(part: float) -> bool:
-        return _ms(control, scaled(model, math.exp(part * end))) <= most
+        return _ms(loop.with_gain(math.exp(part * end))) <= most
 
     low, high = 0.0, 1.0
     if is_within(high):
@@ -351,8 +337,7 @@ def _beyond(deviation: FloatArray, step: Step, largest: float) -> FloatArray:
 
 
 def compare(
-    control: Control,
-    model: TransferFunction,
+    loop: PredictedLoop,
     step: Step,
     time: FloatArray,
     deviation: FloatArray,
@@ -362,8 +347,7 @@ def compare(
 ) -> Comparison:
     """Compare a measured step with the prediction.
 
-    :param control: the controller.
-    :param model: the process as identified.
+    :param loop: controller and process.
     :param step: the step.
     :param time: instants of the samples, the first at the step [s], shape (n,).
     :param deviation: measurement minus its value before the step [y], shape (n,).
@@ -372,8 +356,7 @@ def compare(
     """
 
     def predict(factor: float) -> FloatArray:
-        run = run_loop(control, scaled(model, factor), time, step, limits=limits)
-        return run.measurement
+        return loop.with_gain(factor).run(time, step, limits=limits).measurement
 
     def misfit(log_factor: float) -> float:
         difference = deviation - np.nan_to_num(predict(math.exp(log_factor)), nan=1e9)
@@ -393,7 +376,7 @@ def compare(
     slope = (predict(_SLIGHTLY * ratio) - predict(ratio)) / math.log(_SLIGHTLY)
     seen = float(np.linalg.norm(slope))
     unsure = NOISE_ALLOWANCE * ratio * noise_std / seen if seen > 0.0 else 0.0
-    ms, ms_predicted = _ms(control, scaled(model, ratio)), _ms(control, model)
+    ms, ms_predicted = _ms(loop.with_gain(ratio)), _ms(loop)
     spared = (NOISE_ALLOWANCE - _AT_PEAK) * noise_std / (abs(step.setpoint) or expected.largest)
     compared = _comparisons(measured, expected, spared, ratio, ms, ms_predicted, time)
     # Written so that NaN does not pass.
@@ -425,8 +408,8 @@ def compare(
     )
 
 
-def _ms(control: Control, model: TransferFunction) -> float:
-    ms = Loop(control.law, model).ms()
+def _ms(loop: PredictedLoop) -> float:
+    ms = Loop(loop.control.law, loop.model).ms()
     return ms if math.isfinite(ms) else math.nan
 
 

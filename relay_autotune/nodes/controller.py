@@ -23,7 +23,7 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool, Trigger
 
-from relay_autotune.control.controller import Step, is_usable, running
+from relay_autotune.control.controller import PredictedLoop, Step, is_usable, running
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.errors import (
     FieldError,
@@ -537,8 +537,8 @@ class ControllerNode(ServedNode):
         if doubt and not self.get_parameter("accept_doubtful").value:
             raise NotReadyError(Code.DOUBTFUL_MODEL(doubt=doubt))
         steps, limits = self._steps_of(request), self._settings.limits
-        control = self._place.control(self._place.controller_of(kept))
-        return Verifiable(steps, new, settles, control, model, limits)
+        loop = PredictedLoop(self._place.control(self._place.controller_of(kept)), model)
+        return Verifiable(steps, new, settles, loop, limits)
 
     def _steps_of(self, request: Verify.Goal) -> list[Step]:
         height = request.setpoint_step or self.get_parameter("verify_step").value

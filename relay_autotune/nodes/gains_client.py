@@ -16,7 +16,7 @@ from typing import Any
 from action_msgs.msg import GoalStatus
 from std_srvs.srv import Trigger
 
-from relay_autotune.control.controller import Control
+from relay_autotune.control.controller import Control, PredictedLoop
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.step_choice import StepChoice, StepRange
 from relay_autotune.control.verification import SETTLES, noise_of
@@ -223,10 +223,8 @@ class GainsClient(LoopClient):
         low, high, least, most = self.values(self.name, LIMITS).values()
         limits = Limits(low, high), Limits(least, most)
         model, noise = self.identified()
-        control = self._control(gains)
-        return StepsHere(
-            StepChoice(record_from_message(found), model, control, *limits, noise), given
-        )
+        loop = PredictedLoop(self._control(gains), model)
+        return StepsHere(StepChoice(record_from_message(found), loop, *limits, noise), given)
 
     def _control(self, gains: Controller) -> Control:
         """Return gains as they run in the node that controls."""

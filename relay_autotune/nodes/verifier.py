@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 from rclpy.task import Future
 
-from relay_autotune.control.controller import LONGEST_TIME, Control, Step
+from relay_autotune.control.controller import LONGEST_TIME, PredictedLoop, Step
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import SETTLES, Plan, compare, plan
 from relay_autotune.errors import NotReadyError, RelayAutotuneError
@@ -74,16 +74,14 @@ class Verifiable:
     :param steps: to be made.
     :param new: the gains that are put in force for it; None: those in force are tried.
     :param settles: how long the loop takes to settle with new gains [s]; NaN: not known.
-    :param control: the controller to be tried.
-    :param model: the process as identified.
+    :param loop: the controller to be tried, and the process as identified.
     :param limits: range of the command.
     """
 
     steps: Sequence[Step]
     new: GainSet | None
     settles: float
-    control: Control
-    model: TransferFunction
+    loop: PredictedLoop
     limits: Limits
 
 
@@ -370,8 +368,8 @@ class Verifier:
             lambda: self._at_rest(tried.steps, time.monotonic() - begun < 0.5 * patience),
             begun + patience,
         )
-        loop, noise = (tried.control, tried.model), rest.noise_std
-        plans = await self._computed(lambda: [plan(*loop, s, period, noise) for s in tried.steps])
+        loop, noise = tried.loop, rest.noise_std
+        plans = await self._computed(lambda: [plan(loop, s, period, noise) for s in tried.steps])
         for step, planned in zip(tried.steps, plans, strict=True):
             planned.require_visible(step, noise)
         if tried.new is None:
@@ -660,8 +658,7 @@ def judged(tried: Verifiable, trial: Trial) -> Any:
     trial.plan.require_visible(step, float(np.diff(levels).min()) / math.sqrt(12.0))
     limits = tried.limits
     found = compare(
-        tried.control,
-        tried.model,
+        tried.loop,
         step,
         t - t[0],
         y - rest.measurement,

@@ -24,7 +24,7 @@ from relay_autotune.cli.gains_page import GainsPage
 from relay_autotune.cli.table import beside
 from relay_autotune.cli.terminal import labelled
 from relay_autotune.cli.tuned import Proof, Tuned
-from relay_autotune.control.controller import Control, Step
+from relay_autotune.control.controller import Control, PredictedLoop, Step
 from relay_autotune.control.step_choice import StepChoice, StepRange
 from relay_autotune.control.verification import plan
 from relay_autotune.errors import LoopError, TuningError
@@ -338,9 +338,9 @@ def test_a_plan_counts_the_time_in_which_the_loop_settles_with_new_gains() -> No
     )  # fmt: skip
     limits = Limits(0.0, 80.0), Limits(0.0, 5.0)
     present = Controller(GAINS.kc, GAINS.ti, GAINS.td, GAINS.tf, GAINS.b)
-    step = plan(Control(GAINS), MODEL, Step(setpoint=1.0), 0.1).duration
+    step = plan(PredictedLoop(Control(GAINS), MODEL), Step(setpoint=1.0), 0.1).duration
     for gains, settling in ((GAINS, 1.5 * GAINS.settling_time), (present, 0.0)):
-        choice = StepChoice(record, MODEL, Control(gains), *limits, 0.0)
+        choice = StepChoice(record, PredictedLoop(Control(gains), MODEL), *limits, 0.0)
         told = dict(StepsHere(choice, 0.0).plan(0.5))["expected"]
         assert told.endswith(f" u; it takes about {duration(settling + step)}.")
 

@@ -18,8 +18,8 @@ from relay_autotune.control.controller import (
     Control,
     LawController,
     PidController,
+    PredictedLoop,
     Step,
-    run_loop,
     simulate_closed_loop,
 )
 from relay_autotune.control.verification import compare, plan
@@ -371,25 +371,25 @@ def test_the_controller_that_runs_a_law_does_what_its_source_does_about_a_rest(n
 def test_a_step_of_a_law_is_predicted_as_its_source_makes_it(name):
     rate = LawRate(LAWS[name], PERIOD)
     gains, step = Controller(kc=0.9, ti=2.0, td=0.2), Step(setpoint=0.5)
-    control = Control(gains, rate)
-    wanted = plan(control, PROCESS, step, PERIOD)
+    loop = PredictedLoop(Control(gains, rate), PROCESS)
+    wanted = plan(loop, step, PERIOD)
     plant, source = FopdtPlant(0.9, 2.0, 0.8), Source(name, rate.of(gains).gains)
     time, command = np.arange(int(wanted.duration / PERIOD)) * PERIOD, 0.0
     seen = np.empty(time.size)
     for k, t in enumerate(time):
         seen[k] = plant.advance(t, command)
         command = source.step(step.setpoint, seen[k])
-    found = compare(control, PROCESS, step, time, seen)
+    found = compare(loop, step, time, seen)
     assert found.passed, found.reason
     assert found.predicted == pytest.approx(seen, abs=1e-6)
     assert found.ms_predicted == Loop(rate.of(gains), PROCESS).ms()
     with pytest.raises(TuningError, match=f"{name} runs every 0.25 s"):
-        plan(control, PROCESS, step, 2.0 * PERIOD)
+        plan(loop, step, 2.0 * PERIOD)
     # A program that runs by itself does not wait for samples: every third is heard, and one lost.
     there = np.delete(np.arange(0, time.size, 3), 4)
-    elsewhere = replace(control, elsewhere=True)
-    plan(elsewhere, PROCESS, step, 3.0 * PERIOD)
-    heard = run_loop(elsewhere, PROCESS, time[there], step)
+    elsewhere = replace(loop, control=replace(loop.control, elsewhere=True))
+    plan(elsewhere, step, 3.0 * PERIOD)
+    heard = elsewhere.run(time[there], step)
     assert heard.measurement == pytest.approx(seen[there], abs=1e-6)
 
 

@@ -16,7 +16,13 @@ import pytest
 from fopdt_plant import FopdtPlant
 from scipy.integrate import solve_ivp
 
-from relay_autotune.control.controller import Control, GainBounds, PidController, Step, run_loop
+from relay_autotune.control.controller import (
+    Control,
+    GainBounds,
+    PidController,
+    PredictedLoop,
+    Step,
+)
 from relay_autotune.control.step_choice import StepChoice, StepRange
 from relay_autotune.control.verification import (
     compare,
@@ -37,6 +43,7 @@ from relay_autotune.record.record import Record, RelaySettings
 
 GAINS = Controller(kc=1.2, ti=2.0)
 PROCESS = structure_named("fopdt").of_fields(gain=1.5, time_constants=[2.0], dead_time=0.4)
+LOOP = PredictedLoop(Control(GAINS), PROCESS)
 
 
 def closed_loop(controller, plant, period, steps, *, setpoint=1.0, load=0.0, start=0):
@@ -141,8 +148,8 @@ def test_jitter_changes_little():
     steady = np.arange(400) * 0.05
     shaken = steady + np.append(0.0, rng.uniform(0.0, 0.02, 399))
     gains = Controller(kc=1.2, ti=2.0, td=0.1, tf=0.05)
-    exact = run_loop(Control(gains), PROCESS, steady, Step(setpoint=1.0))
-    other = run_loop(Control(gains), PROCESS, shaken, Step(setpoint=1.0))
+    loop = PredictedLoop(Control(gains), PROCESS)
+    exact, other = (loop.run(time, Step(setpoint=1.0)) for time in (steady, shaken))
     at = np.interp(steady, shaken, other.measurement)
     assert np.abs(at - exact.measurement).max() < 0.03
 
@@ -152,9 +159,9 @@ def test_jitter_changes_little():
 
 @cache
 def measured(process, step, noise_std=0.0, gains=GAINS, period=0.05):
-    wanted = plan(Control(gains), PROCESS, step, period, noise_std)
+    wanted = plan(PredictedLoop(Control(gains), PROCESS), step, period, noise_std)
     time = np.arange(int(wanted.duration / period)) * period
-    run = run_loop(Control(gains), process, time, step)
+    run = PredictedLoop(Control(gains), process).run(time, step)
     noise = noise_std * np.random.default_rng(4).standard_normal(time.size)
     return time, run.measurement + noise
 
@@ -164,7 +171,7 @@ def measured(process, step, noise_std=0.0, gains=GAINS, period=0.05):
 @pytest.mark.parametrize("noise_std", [0.0, 0.01])
 def test_the_process_itself_passes(step, noise_std):
     time, y = measured(PROCESS, step, noise_std)
-    found = compare(Control(GAINS), PROCESS, step, time, y, noise_std=noise_std)
+    found = compare(LOOP, step, time, y, noise_std=noise_std)
     assert found.passed, found.reason
     assert found.gain_ratio == pytest.approx(1.0, abs=0.05)
     assert found.fit > 0.8
@@ -175,7 +182,7 @@ def test_the_settling_time_is_predicted_within_the_band_in_which_it_is_measured(
     """8 s within 11 % stood beside 25 s predicted within 5 %, of a loop as predicted."""
     time, y = measured(PROCESS, step)
     noise_std = 0.05 * (abs(step.setpoint) or np.max(np.abs(y)))
-    found = compare(Control(GAINS), PROCESS, step, time, y, noise_std=noise_std)
+    found = compare(LOOP, step, time, y, noise_std=noise_std)
     band = found.why["settled_band"]
     assert band == pytest.approx(0.05 + 3.0 * 0.05)
     # the response is the prediction itself: it leaves the band last where both say
@@ -184,7 +191,7 @@ def test_the_settling_time_is_predicted_within_the_band_in_which_it_is_measured(
     assert found.expected.settling_time == pytest.approx(last, abs=0.2)
     assert found.measured.settling_time == pytest.approx(last)
     assert f"settling to 20 % {last:.3g} s" in found.reason
-    clean = compare(Control(GAINS), PROCESS, step, time, y)
+    clean = compare(LOOP, step, time, y)
     assert "settling to 5 % " in clean.reason
     assert clean.expected.settling_time > 1.2 * last
 
@@ -194,13 +201,11 @@ def test_the_uncertainty_of_the_gain_is_three_standard_deviations_of_it():
     step, noise_std, rng = Step(setpoint=0.5), 0.02, np.random.default_rng(8)
     time, exact = measured(PROCESS, step)
     noise = noise_std * rng.standard_normal((40, time.size))
-    found = [
-        compare(Control(GAINS), PROCESS, step, time, exact + n, noise_std=noise_std) for n in noise
-    ]
+    found = [compare(LOOP, step, time, exact + n, noise_std=noise_std) for n in noise]
     spread = np.std([each.gain_ratio for each in found])
     told = np.mean([each.why["gain_uncertainty"] for each in found])
     assert told == pytest.approx(3.0 * spread, rel=0.35)
-    assert compare(Control(GAINS), PROCESS, step, time, exact).why["gain_uncertainty"] == 0.0
+    assert compare(LOOP, step, time, exact).why["gain_uncertainty"] == 0.0
 
 
 @pytest.mark.long
@@ -208,7 +213,7 @@ def test_the_uncertainty_of_the_gain_is_three_standard_deviations_of_it():
 @pytest.mark.parametrize("factor", [0.4, 2.2])
 def test_a_process_of_another_gain_fails_with_its_ratio(step, factor):
     time, y = measured(replace(PROCESS, gain=factor * PROCESS.gain), step)
-    found = compare(Control(GAINS), PROCESS, step, time, y)
+    found = compare(LOOP, step, time, y)
     assert not found.passed
     assert found.gain_ratio == pytest.approx(factor, rel=0.05)
     assert "another gain than the model" in found.reason
@@ -219,12 +224,12 @@ def test_a_process_of_another_gain_fails_with_its_ratio(step, factor):
 @pytest.mark.parametrize(("factor", "step"), [(0.64, Step(load=0.4)), (1.5, Step(setpoint=0.5))])
 def test_what_is_close_to_its_limit_passes_narrowly_with_the_limit(factor, step):
     other = replace(PROCESS, gain=factor * PROCESS.gain)
-    found = compare(Control(GAINS), PROCESS, step, *measured(other, step))
+    found = compare(LOOP, step, *measured(other, step))
     assert found.passed
     assert found.why.code is Code.NARROWLY
     near = f"the gain is {factor:.2f} times the model's, 0.6 to 1.7 passes"
     assert near in str(found.why["narrow"])
-    same = compare(Control(GAINS), PROCESS, step, *measured(PROCESS, step))
+    same = compare(LOOP, step, *measured(PROCESS, step))
     assert same.why.code is Code.AS_PREDICTED
 
 
@@ -247,14 +252,14 @@ def test_the_step_that_proves_is_clear_of_the_noise_and_within_limits(
         time=np.arange(401.0), measurement=swing, command=np.full(401, 2.0),
         settings=RelaySettings(40.0, 2.0, 1.0), noise_std=noise_std, cycle_start=(0, 200, 400),
     )  # fmt: skip
-    model = TransferFunction.fopdt(1.65, 1.0, 0.5)
+    loop = PredictedLoop(Control(GAINS), TransferFunction.fopdt(1.65, 1.0, 0.5))
     room = Limits(30.0, high)
     noise = noise_of(0.5 * noise_std, noise_std)
     assert noise == noise_of(noise_std, math.nan) == noise_std
     commands = Limits(0.0, command_high)
-    assert StepChoice(record, model, Control(GAINS), room, commands, noise).best == height
+    assert StepChoice(record, loop, room, commands, noise).best == height
     # Without room on either side it goes as far as it can.
-    tight = StepChoice(record, model, Control(GAINS), Limits(39.9, 40.1), commands, noise).best
+    tight = StepChoice(record, loop, Limits(39.9, 40.1), commands, noise).best
     assert abs(tight) == pytest.approx(0.08)
 
 
@@ -263,21 +268,20 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
         time=0.01 * np.arange(401.0), measurement=np.full(401, 40.0), command=np.full(401, 2.0),
         settings=RelaySettings(40.0, 2.0, 1.0), noise_std=0.02, cycle_start=(0, 200, 400),
     )  # fmt: skip
-    model, gains = TransferFunction.fopdt(1.65, 1.0, 0.5), Controller(kc=0.9, ti=0.9)
-    wanted = plan(Control(gains), model, Step(setpoint=1.0), 0.01)
+    gains = Controller(kc=0.9, ti=0.9)
+    loop = PredictedLoop(Control(gains), TransferFunction.fopdt(1.65, 1.0, 0.5))
+    wanted = plan(loop, Step(setpoint=1.0), 0.01)
     assert 1.1 < wanted.peak < 2.0
-    choice = StepChoice(record, model, Control(gains), Limits(30.0, 42.0), Limits(0.0, 5.0), 0.02)
+    choice = StepChoice(record, loop, Limits(30.0, 42.0), Limits(0.0, 5.0), 0.02)
     allowed = choice.allowed
     low, high = allowed.low, allowed.high
     assert allowed.least == rounded(0.02 * wanted.visible) == pytest.approx(0.15, abs=0.04)
     # The command holds down to 3.3 below; the peak of the next step of two digits is too high.
     assert low == -3.3
-    at_peak = [
-        plan(Control(gains), model, Step(setpoint=h), 0.01).peak for h in (high, high + 0.1)
-    ]
+    at_peak = [plan(loop, Step(setpoint=h), 0.01).peak for h in (high, high + 0.1)]
     assert at_peak[0] < 2.0 - 3.0 * 0.02 < at_peak[1]
     # a step down is no other plan than one up, upside down
-    down = plan(Control(gains), model, Step(setpoint=-0.7), 0.01).command
+    down = plan(loop, Step(setpoint=-0.7), 0.01).command
     quiet = replace(choice, noise_std=0.0)
     assert quiet.expected(-0.7) == f"from {2.0 + down[0]:.3g} to {2.0 + down[1]:.3g} u"
     peak = replace(wanted, peak=1.2, visible=0.0)
@@ -305,13 +309,12 @@ def test_the_command_that_is_expected_holds_what_the_noise_does(rate):
     model = structure_named("three_lags").of_fields(
         gain=3.0, time_constants=[6.0, 1.25, 0.4], dead_time=0.3
     )
+    loop = PredictedLoop(control, model)
     record = Record(
         time=time, measurement=np.full(2000, 140.0), command=np.full(2000, 40.0),
         settings=RelaySettings(140.0, 40.0, 10.0), noise_std=noise_std, cycle_start=(0, 900, 1800),
     )  # fmt: skip
-    choice = StepChoice(
-        record, model, control, Limits(100.0, 200.0), Limits(0.0, 100.0), noise_std
-    )
+    choice = StepChoice(record, loop, Limits(100.0, 200.0), Limits(0.0, 100.0), noise_std)
     (low, high), (least, most) = (
         (float(told[1]), float(told[3]))
         for told in (
@@ -319,7 +322,7 @@ def test_the_command_that_is_expected_holds_what_the_noise_does(rate):
         )
     )
     noise = np.random.default_rng(5).normal(0.0, noise_std, 2000)
-    spread = 3.0 * float(np.std(run_loop(control, model, time, Step(), noise=noise).command))
+    spread = 3.0 * float(np.std(loop.run(time, Step(), noise=noise).command))
     assert (least - low, high - most) == pytest.approx((spread, spread), rel=0.1)
 
 
@@ -330,15 +333,14 @@ def test_the_command_that_is_expected_holds_what_the_noise_does(rate):
 def test_the_least_step_is_where_the_noise_begins_to_decide(step, less):
     """The chance of a wrong verdict by its definition: many steps, judged."""
     period, rng = 0.1, np.random.default_rng(7)
-    tried = Control(GAINS)
-    wanted = plan(tried, PROCESS, step, period)
+    wanted = plan(LOOP, step, period)
     time = np.arange(int(wanted.duration / period) + 1) * period
 
     def failures(height: float, count: int) -> Iterator[bool]:
         made = replace(step, setpoint=height * step.setpoint, load=height * step.load)
-        response = run_loop(tried, PROCESS, time, made).measurement
+        response = LOOP.run(time, made).measurement
         noisy = (response + rng.normal(size=time.size) for _ in range(count))
-        return (not compare(tried, PROCESS, made, time, y, noise_std=1.0).passed for y in noisy)
+        return (not compare(LOOP, made, time, y, noise_std=1.0).passed for y in noisy)
 
     assert not any(failures(wanted.visible, 20))
     # The second one ends the search.
@@ -350,7 +352,7 @@ def test_the_least_step_is_where_the_noise_begins_to_decide(step, less):
 def test_a_longer_dead_time_fails():
     slow = replace(PROCESS, dead_time=1.6)
     time, y = measured(slow, Step(setpoint=0.5))
-    assert not compare(Control(GAINS), PROCESS, Step(setpoint=0.5), time, y).passed
+    assert not compare(LOOP, Step(setpoint=0.5), time, y).passed
 
 
 def test_a_step_is_described_as_it_is():
@@ -381,14 +383,16 @@ def test_noise_does_not_change_the_overshoot_that_is_told():
 
 def test_a_step_down_is_seen_as_well_as_one_up():
     """Its overshoot had the wrong sign, so that no step was large enough."""
-    up, down = (plan(Control(GAINS), PROCESS, Step(setpoint=h), 0.05) for h in (0.5, -0.5))
+    up, down = (plan(LOOP, Step(setpoint=h), 0.05) for h in (0.5, -0.5))
     assert down.visible == pytest.approx(up.visible, rel=1e-6)
     assert 0.0 < up.visible < 100.0
 
 
 def test_gains_that_are_unstable_on_the_model_are_not_tried():
     with pytest.raises(TuningError, match="unstable loop"):
-        plan(Control(Controller(kc=20.0, ti=1.0)), PROCESS, Step(setpoint=1.0), 0.05)
+        plan(
+            PredictedLoop(Control(Controller(kc=20.0, ti=1.0)), PROCESS), Step(setpoint=1.0), 0.05
+        )
 
 
 # Samples that cannot be true.

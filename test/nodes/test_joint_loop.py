@@ -21,7 +21,7 @@ from relay_autotune.cli import joint_tune
 from relay_autotune.cli.joint_tune import JointLoop
 from relay_autotune.cli.loops import Loop
 from relay_autotune.cli.settings import Answers
-from relay_autotune.control.controller import Step
+from relay_autotune.control.controller import PredictedLoop, Step
 from relay_autotune.control.verification import compare
 from relay_autotune.errors import LoopError
 from relay_autotune.identification.judgement.table import CHECKS
@@ -168,8 +168,8 @@ def test_a_step_of_a_joint_with_a_velocity_state_is_predicted_as_it_is_made() ->
     arm = Arm()
     rate = LawRate(laws.LAWS[joint_loop(arm, arm, "arm", "arm_2").law], period)
     model = TransferFunction(1.0, (), (lag,), dead_time=0.03, integrators=1)
-    control = in_another_node(gains, rate, 0.0)
-    found = compare(control, model, Step(setpoint=1.0), period * np.arange(300), np.array(seen))
+    loop = PredictedLoop(in_another_node(gains, rate, 0.0), model)
+    found = compare(loop, Step(setpoint=1.0), period * np.arange(300), np.array(seen))
     assert found.passed, found.reason
     assert found.expected.overshoot == pytest.approx(found.measured.overshoot, abs=0.01)
     assert found.gain_ratio == pytest.approx(1.0, abs=0.03)

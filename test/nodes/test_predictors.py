@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from relay_autotune.control.controller import Control, GainBounds, Step, run_loop
+from relay_autotune.control.controller import Control, GainBounds, PredictedLoop, Step
 from relay_autotune.control.gains_history import GainSet
 from relay_autotune.control.verification import plan
 from relay_autotune.errors import NotReadyError, TuningError
@@ -86,10 +86,11 @@ def test_a_sensor_that_is_too_coarse_for_a_step_gives_no_verdict() -> None:
     """The loop stands on one of its values, so that its rest shows no noise."""
     gains, step = Controller(0.5, 0.6), Step(setpoint=0.01)
     model = TransferFunction.fopdt(2.0, 0.5, 0.2)
-    tried = Verifiable([step], None, math.nan, Control(gains), model, UNLIMITED)
-    planned, rest = plan(Control(gains), model, step, 0.05), Rest(5.0, 1.0, 0.0)
+    loop = PredictedLoop(Control(gains), model)
+    tried = Verifiable([step], None, math.nan, loop, UNLIMITED)
+    planned, rest = plan(loop, step, 0.05), Rest(5.0, 1.0, 0.0)
     time = np.arange(0.0, planned.duration, 0.05)
-    exact = 5.0 + run_loop(Control(gains), model, time, Step(setpoint=0.01)).measurement
+    exact = 5.0 + loop.run(time, Step(setpoint=0.01)).measurement
 
     def seen(resolution: float) -> Any:
         y = np.round(exact / resolution) * resolution
