@@ -91,7 +91,7 @@ class RelayNode(ServedNode):
         hears(DiagnosticStatus, SIGNS_OF_LIFE, self._on_status, quality.RESULT)
         self._hear = self._sensor.hear
         self._topic = self._sensor.subscription.topic_name
-        self._results = OwnResults(self)
+        self._results = OwnResults(self, on_setpoint=self._on_setpoint)
         self._arrival = arrival(self)
         # The others of the loop go on while it waits.
         waiting = ReentrantCallbackGroup()
@@ -292,7 +292,7 @@ class RelayNode(ServedNode):
         session = self._session
         running = session if session is not None and message.experiment_id == session.id else None
         now = self._now_ns()
-        taken = self._results.take(name, message, running, self._on_setpoint)
+        taken = self._results.take(name, message, running)
         for topic, found in taken:
             if (tune := self._tunes.get(found.experiment_id)) is not None:
                 # The last result closes the recording, and that ends the goal.

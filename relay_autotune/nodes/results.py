@@ -271,37 +271,36 @@ class OwnResults(ResultCheck):
     """Accept results of this node's own experiments only.
 
     :param node: relay_node.
+    :param on_setpoint: True if its relay moves a set-point, so that levels and sign of the relay
+        are not those of the command.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, *, on_setpoint: bool) -> None:
         super().__init__(node)
+        self._on_setpoint = on_setpoint
         # Gains that arrived before their model.
         self._early: tuple[str, Any] | None = None
         # Of the running experiment: its id and number of switches, its facts, its swing [y].
         self._so_far = ("", 0), ExperimentFacts(Outcome.UNKNOWN, 0.0), math.nan
 
-    def take(
-        self, name: str, message: Any, running: Session | None, on_setpoint: bool
-    ) -> list[tuple[str, Any]]:
+    def take(self, name: str, message: Any, running: Session | None) -> list[tuple[str, Any]]:
         """Return the messages that may be stored, each with the name of its topic.
 
         :param name: the message's topic, ``transfer_function`` or ``pi_gains``.
         :param message: the message.
         :param running: the session of its experiment, if that still runs.
-        :param on_setpoint: True if the relay moves a set-point, so that its levels and its sign
-            are not those of the command.
         """
         of = message.experiment_id
         found: list[tuple[str, Any]] = []
         with self.refusals.saying("the model" if name == MODEL else "gains", of):
             if running is not None:
-                self._require_possible(name, message, running, on_setpoint)
+                self._require_possible(name, message, running)
             if name == MODEL:
                 if self.model(message) is not None:
                     found.append((name, message))
                     if (early := self._early) is not None and message.final:
                         self._early = None
-                        found += self.take(*early, running, on_setpoint)
+                        found += self.take(*early, running)
             elif message.final and of in self._evidence and of not in self.models:
                 self._early = name, message
             else:
@@ -309,9 +308,7 @@ class OwnResults(ResultCheck):
                 found.append((name, message))
         return found
 
-    def _require_possible(
-        self, name: str, message: Any, running: Session, on_setpoint: bool
-    ) -> None:
+    def _require_possible(self, name: str, message: Any, running: Session) -> None:
         """Refuse what cannot be said of an experiment that still runs."""
         if name != MODEL or message.final:
             raise TuningError(_TOO_SOON)
@@ -319,7 +316,7 @@ class OwnResults(ResultCheck):
         sign, amplitude, relay = experiment.facts.sign, math.nan, math.nan
         cycles, settings = experiment.cycles, experiment.settings
         facts, swing = self._facts_so_far(running)
-        if on_setpoint:
+        if self._on_setpoint:
             sign = 0
         elif settings is not None:
             amplitude = cycles[-1].amplitude if cycles else 0.5 * swing

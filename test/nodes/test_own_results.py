@@ -53,7 +53,8 @@ def taken(session: Session, process: Process, **finding: float) -> bool:
     message.numerator = float64_array(process.numerator)
     message.denominator = float64_array(process.denominator)
     node: Any = SimpleNamespace(get_logger=lambda: SimpleNamespace(error=lambda _: None))
-    return bool(OwnResults(node).take("transfer_function", message, session, False))
+    results = OwnResults(node, on_setpoint=False)
+    return bool(results.take("transfer_function", message, session))
 
 
 def test_a_model_of_the_process_is_accepted(session: Session) -> None:
