@@ -90,7 +90,7 @@ class Recording:
         # The results that it lacks, and for how long it waits for them.
         self._missing = list(RESULTS)
         self._timer: Timer | None = None
-        self._until = self._patience = 0.0
+        self._until = self._timeout = self._patience = 0.0
         self._waits_since = self._heard_at = -math.inf
         self._reason = self._stage = ""
         self._closed: Callable[[str], None] | None = None
@@ -155,11 +155,8 @@ class Recording:
                 f"{duration(self._patience)}"
             )
 
-    def awaited(self, timeout: float) -> str:
-        """Say what it waits for after the end of the tune; "" if it waits for nothing.
-
-        :param timeout: as of `close_with_results` [s].
-        """
+    def awaited(self) -> str:
+        """Say what it waits for after the end of the tune; "" if it waits for nothing."""
         if not self.is_waiting:
             return ""
         now = time.monotonic()
@@ -169,7 +166,7 @@ class Recording:
             stage = f": {self._stage}" if self._stage else " so far"
             return f"computing the model, {duration(now - self._waits_since)}{stage}"
         silent = duration(now - max(self._waits_since, self._heard_at))
-        return f"waiting for identifier_node, {silent} of {duration(timeout)} at most"
+        return f"waiting for identifier_node, {silent} of {duration(self._timeout)} at most"
 
     def close_with_results(self, timeout: float, closed: Callable[[str], None]) -> None:
         """Close it once model and gains are in it, or after a timeout.
@@ -185,7 +182,7 @@ class Recording:
         if timeout > 0.0:
             silent = f"identifier_node did not send them within {timeout:g} s"
         self._waits_since = time.monotonic()
-        self._patience = LONGEST * timeout
+        self._timeout, self._patience = timeout, LONGEST * timeout
         self._until = self._waits_since + self._patience
         self._timer = self._node.create_timer(
             max(timeout, 1e-3), lambda: self.wait_no_longer(silent), clock=STEADY

@@ -415,9 +415,8 @@ class RelayNode(ServedNode):
     def _words(self) -> str:
         """Say what the tune waits for and sees; empty where none runs or waits for its model."""
         if (session := self._session) is None:
-            timeout = self.get_parameter("model_timeout").value
             waiting = self._told
-            return "" if waiting is None else waiting.recording.awaited(timeout)
+            return "" if waiting is None else waiting.recording.awaited()
         sentence = session.experiment.status
         if (age := self._sensor.age) > max(SILENT, 2.0 * self._sensor.samples.interval):
             sentence += f"; no measurement for {duration(age)}"

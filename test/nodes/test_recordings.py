@@ -69,7 +69,7 @@ def test_one_that_lacks_results_is_told_after_one_that_lacks_nothing(
             (experiment, True, ""), (experiment, True, "comparing structures"),
         ]  # fmt: skip
         recording.note_progress(*said_by(signs[-1])[1:])
-        waits_for = recording.awaited(0.05)
+        waits_for = recording.awaited()
         assert waits_for.endswith("s: comparing structures") is not complete
         # The identifier has sent all, of which the model was refused.
         recording.note_progress(False, "the model was refused")
@@ -122,7 +122,7 @@ def test_it_waits_as_long_as_the_identifier_gets_on(
         now[0] += 100.0
         recording.note_progress(True, stage)
     assert now[0] == 2500.0
-    waits_for = recording.awaited(10.0)
+    waits_for = recording.awaited()
     assert waits_for.startswith("waiting for identifier_node")
     recording.close("")
     (reason,) = closed
