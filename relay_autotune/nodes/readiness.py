@@ -178,22 +178,21 @@ class Readiness:
 
     def __init__(self, node: Node, loop: LoopSupervisor) -> None:
         self._node, self._loop, self._sensor = node, loop, loop.sensor
+        self.last: tuple[float, Cycle] | None = None
+        """Amplitude of the last tune [u], and its last cycle; None: there is none."""
 
-    def of(
-        self, amplitude: float, checks: Checklist, last: tuple[float, Cycle] | None
-    ) -> Ready | None:
+    def of(self, amplitude: float, checks: Checklist) -> Ready | None:
         """Make the checks, and return what a tune would do; None where one of them failed.
 
         :param amplitude: half the distance of the two levels [u]; 0: the parameter.
         :param checks: get a line each.
-        :param last: amplitude of the last tune [u], and its last cycle; None: there is none.
         """
         values = values_of(self._node, TUNE_PARAMETERS)
         chosen = {entry.name: values[entry.name] for entry in EXPERIMENT_PARAMETERS}
         if amplitude != 0.0:
             chosen["amplitude"] = amplitude
         parameters = ExperimentParameters(**chosen)
-        ready = checks.do("levels", partial(self._planned, values, parameters, last))
+        ready = checks.do("levels", partial(self._planned, values, parameters))
         checks.do("measurement", self._measured)
         checks.do("command", self._commanded)
         checks.do("alone", partial(self._alone, values["sample_period"]))
@@ -202,17 +201,12 @@ class Readiness:
         checks.tell("at rest", _rest_of(self._sensor.samples))
         checks.tell("recording", _recording_in(values["record_directory"]))
         checks.tell("model", _identifier_of(self._node))
-        checks.tell("expected", *_expected(parameters, self._sensor.samples, last))
+        checks.tell("expected", *_expected(parameters, self._sensor.samples, self.last))
         interval = self._sensor.samples.interval
         checks.tell("time", ready.takes if ready else how_long(parameters, interval))
         return None if checks.refusals else ready
 
-    def _planned(
-        self,
-        values: Mapping[str, Any],
-        parameters: ExperimentParameters,
-        last: tuple[float, Cycle] | None,
-    ) -> Ready:
+    def _planned(self, values: Mapping[str, Any], parameters: ExperimentParameters) -> Ready:
         """Return what a tune would do; raise the reason where that is not possible."""
         moves_setpoint = self._loop.setpoint is not None
         if moves_setpoint:
@@ -227,7 +221,7 @@ class Readiness:
         # actuator ends.
         shows_ends = moves_setpoint or self._node.count_publishers("command_feedback") > 0
         from_small = not (shows_ends or parameters.finds_amplitude)
-        period = last[1].period if last is not None else math.nan
+        period = math.nan if self.last is None else self.last[1].period
         takes = how_long(parameters, self._sensor.samples.interval, from_small=from_small)
         return Ready(parameters, baseline, policy, from_small, period, takes)
 

@@ -35,7 +35,7 @@ from relay_autotune.nodes.session import Session, SetpointSession
 from relay_autotune.nodes.tables import FIXED_PARAMETERS, TUNE_PARAMETERS
 from relay_autotune.nodes.watch import Sensor, arrival
 from relay_autotune.reasons import Code, Reason
-from relay_autotune.record.record import Cycle, Outcome
+from relay_autotune.record.record import Outcome
 from relay_autotune.text import duration
 from relay_autotune_msgs.msg import PidGains, RelayCycle, TransferFunction
 from relay_autotune_msgs.msg import RelayExperiment as ExperimentMessage
@@ -63,8 +63,6 @@ class RelayNode(ServedNode):
         fixed = values_of(self, FIXED_PARAMETERS)
         self._session: Session | None = None
         self._simulated = bool(self.get_parameter("use_sim_time").value)
-        # Amplitude and last cycle of the last tune.
-        self._last_cycle: tuple[float, Cycle] | None = None
         self._ahead = 0
         self._summary = "no tune yet"
         self._alarm = ""
@@ -187,7 +185,7 @@ class RelayNode(ServedNode):
         if self._session is not None:
             return self._refuse(Code.RUNNING(tune=self._session.id, node=self._name))
         checks = Checklist()
-        ready = self._readiness.of(amplitude, checks, self._last_cycle)
+        ready = self._readiness.of(amplitude, checks)
         if ready is None:
             return answer_of(checks) if dry_run else self._refuse(checks.refusals[0])
         if dry_run:
@@ -363,7 +361,7 @@ class RelayNode(ServedNode):
         self._summary = f"last tune {session.id} {outcome}: {experiment.reason}"
         completed = experiment.outcome == Outcome.COMPLETED
         if experiment.cycles and experiment.settings is not None:
-            self._last_cycle = experiment.settings.amplitude, experiment.cycles[-1]
+            self._readiness.last = experiment.settings.amplitude, experiment.cycles[-1]
         self._alarm = "" if completed else self._summary
         count = session.lost_samples
         lost = str(Code.NOTE_LOST(samples=count)) if count else ""
