@@ -47,12 +47,12 @@ from relay_autotune.nodes.gains_place import (
     setpoint_message,
 )
 from relay_autotune.nodes.goals import serve
-from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
+from relay_autotune.nodes.lifetime import STEADY, run
 from relay_autotune.nodes.live_types import CommandMessage, command_reader, reader_of
 from relay_autotune.nodes.loop_ends import CommandPublisher
 from relay_autotune.nodes.parameters import ask_before_changes, declare, merged, values_of
 from relay_autotune.nodes.results import ResultCheck
-from relay_autotune.nodes.verifier import Predictors, Verifiable, Verifier
+from relay_autotune.nodes.verifier import Predictors, ProvenNode, Verifiable, Verifier
 from relay_autotune.nodes.watch import Sensor, require_own_time
 from relay_autotune.reasons import Code, Reason
 from relay_autotune_msgs.action import Verify
@@ -111,7 +111,7 @@ _LOOK_EVERY = 0.2
 END_WITHIN = 5.0
 
 
-class ControllerNode(ServedNode):
+class ControllerNode(ProvenNode):
     """Answer each measurement with a command.
 
     New gains wait until they are applied, and the previous gains are kept for ``~/revert``. While
@@ -162,14 +162,7 @@ class ControllerNode(ServedNode):
         self._offset = self._load = 0.0
         # True while this node writes its gains into its own parameters.
         self._following = False
-        self._verifier = Verifier(
-            self,
-            prepare=self._prepare_verification,
-            begin=lambda tried: self._keeper.begin_verification(tried.new),
-            move=self._move,
-            ended=lambda passed: self._keeper.end_verification(passed),
-            silent=self._why_silent,
-        )
+        self._verifier = Verifier(self)
         self._remote: RemoteController | None = None
         setpoints, self._reported = setpoint_message(values), command_reader(values)
         if values["apply_to"]:
@@ -198,8 +191,8 @@ class ControllerNode(ServedNode):
         waiting = {"callback_group": ReentrantCallbackGroup()}
         serve(self, Trigger, "~/apply", lambda _: self._logged(self._apply()), **waiting)
         serve(self, Trigger, "~/discard", self._discard)
-        serve(self, Trigger, "~/before", lambda _: self._keeper.before())
-        serve(self, Trigger, "~/revert", lambda _: self._logged(self._keeper.revert()), **waiting)
+        serve(self, Trigger, "~/before", lambda _: self.keeper.before())
+        serve(self, Trigger, "~/revert", lambda _: self._logged(self.keeper.revert()), **waiting)
         serve(self, SetBool, "~/automatic", self._switch)
         ask_before_changes(self, self._require_settable)
         self.add_post_set_parameters_callback(self._after_set)
@@ -214,9 +207,9 @@ class ControllerNode(ServedNode):
             "" if values["apply_to"] else self._commands.topic,
         )
         given = self._own(gains) if self._remote is None else None
-        self._keeper = GainsKeeper(self, self._place, journal, given, self._require_bounds)
-        if self._remote is None and self._keeper.history.gains != given:
-            self._use(self._keeper.history.gains)
+        self.keeper = GainsKeeper(self, self._place, journal, given, self._require_bounds)
+        if self._remote is None and self.keeper.history.gains != given:
+            self._use(self.keeper.history.gains)
             self.get_logger().warning(
                 f"starts with {controller_text(self._pid.gains)}, not with the parameters' "
                 f"{controller_text(gains)}, for what was proven or failed before: see "
@@ -358,7 +351,7 @@ class ControllerNode(ServedNode):
         elif self._held or self._untaken:
             self._pid.track(command)
 
-    def _why_silent(self, silence: float) -> Reason:
+    def why_silent(self, silence: float) -> Reason:
         """Return what it means that no command has come for a time [s]."""
         if self._remote is not None:
             return Code.SILENT_OWNER(node=self._place.name, silence=silence)
@@ -397,7 +390,7 @@ class ControllerNode(ServedNode):
             gains = self._results.gains(message)
             self._place.require_law(gains)
             self._settings.bounds.require(gains)
-            self._keeper.history.require_not_failed(self._place.set_of(gains))
+            self.keeper.history.require_not_failed(self._place.set_of(gains))
         except RelayAutotuneError as error:
             self._results.refusals.say("gains", name, error)
             self._refused = self._results.refusals.last
@@ -407,7 +400,7 @@ class ControllerNode(ServedNode):
         if self._doubt:
             self.get_logger().warning(f"gains of {name} are not trusted: {self._doubt}")
         asked = self.get_parameter("auto_apply").value
-        cut_short = not self._keeper.history.is_open_to(self._place.set_of(gains))
+        cut_short = not self.keeper.history.is_open_to(self._place.set_of(gains))
         if self._doubt or cut_short or not asked:
             self.get_logger().info(
                 f"gains of {name} wait: {controller_text(gains)}; call "
@@ -434,7 +427,7 @@ class ControllerNode(ServedNode):
         name, gains = self._newest
         if not self.get_parameter("auto_apply").value:
             return
-        if not self._keeper.history.is_open_to(self._place.set_of(gains)):
+        if not self.keeper.history.is_open_to(self._place.set_of(gains)):
             return
         doubt = self._results.doubt(name, gains)
         if doubt:
@@ -483,11 +476,11 @@ class ControllerNode(ServedNode):
     async def _apply(self) -> str:
         name, gains = self._acceptable()
         try:
-            done = await self._keeper.apply(self._place.set_of(gains))
+            done = await self.keeper.apply(self._place.set_of(gains))
         except RelayAutotuneError as error:
             raise _not_in_force(name, error) from error
         with suppress(TuningError):
-            self._keeper.before()
+            self.keeper.before()
             done += "; ~/revert brings back those before"
         return f"gains of {name}: {done}"
 
@@ -516,7 +509,8 @@ class ControllerNode(ServedNode):
 
     # Proof.
 
-    async def _prepare_verification(self, request: Verify.Goal) -> Verifiable:
+    async def prepare_verification(self, request: Verify.Goal) -> Verifiable:
+        """Return what is to be verified, if the loop is ready."""
         if self._held:
             raise NotReadyError(Code.TUNING())
         self._predictors.require_any()
@@ -530,7 +524,7 @@ class ControllerNode(ServedNode):
         if request.apply:
             _, gains = self._acceptable()
             new, settles = self._place.set_of(gains), gains.settling_time
-        kept = new or await self._place.read() or self._keeper.history.gains
+        kept = new or await self._place.read() or self.keeper.history.gains
         if kept is None or (self._remote is None and self._pid.is_manual):
             raise NotReadyError(Code.NOT_AUTOMATIC())
         model, doubt = self._predictors.of(kept)
@@ -573,7 +567,8 @@ class ControllerNode(ServedNode):
         steps = [Step(setpoint=height)] if height else []
         return steps + ([Step(load=request.load_step)] if request.load_step else [])
 
-    def _move(self, setpoint: float, load: float) -> None:
+    def move(self, setpoint: float, load: float) -> None:
+        """Put a step on set-point [y] and command [u]; 0: none."""
         if self._remote is not None:
             self._remote.move(setpoint)
         self._offset, self._load = setpoint, load
@@ -583,7 +578,7 @@ class ControllerNode(ServedNode):
     def end(self, reason: Reason) -> None:
         """Undo the steps of a verification, and leave a safe command and trusted gains."""
         rested = self._verifier.rested_at
-        at_work = self._verifier.is_running or self._keeper.is_at_work
+        at_work = self._verifier.is_running or self.keeper.is_at_work
         self._ending = True
         self._verifier.interrupt(reason)
         if self._remote is not None:
@@ -603,7 +598,7 @@ class ControllerNode(ServedNode):
         deadline = time.monotonic() + END_WITHIN
         while time.monotonic() < deadline and self._verifier.is_running:
             self.executor.turn(0.02)
-        undone = self.executor.create_task(self._keeper.abandon)
+        undone = self.executor.create_task(self.keeper.abandon)
         while time.monotonic() < deadline and not undone.done():
             self.executor.turn(0.02)
         # Give the action's client its result.
@@ -629,7 +624,7 @@ class ControllerNode(ServedNode):
         gains = tables.settings_from(values, self._rate).gains
         if self._remote is None and {change.name for change in changes} & NAMES_OF_GAINS:
             odd = self._why_odd(gains)
-            self._keeper.edit(self._own(gains))
+            self.keeper.edit(self._own(gains))
             if odd:
                 self.get_logger().warning(odd)
 

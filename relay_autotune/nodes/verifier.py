@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -30,6 +30,7 @@ from relay_autotune.exchange.messages import (
 from relay_autotune.experiment.settling import rest_state, slow_movement
 from relay_autotune.loop.sampled import Limits
 from relay_autotune.nodes import quality
+from relay_autotune.nodes.gains_keeper import GainsKeeper
 from relay_autotune.nodes.goals import Narrator, conclude, serve_goals
 from relay_autotune.nodes.lifetime import ServedNode
 from relay_autotune.nodes.results import keep
@@ -242,36 +243,48 @@ class _EndedError(Exception):
     """The proof has ended before its course did."""
 
 
+class ProvenNode(ServedNode):
+    """A node with a loop on which gains can be proven."""
+
+    keeper: GainsKeeper
+    """Keeps its gains: nothing has changed before it begins a proof, and it takes every end."""
+
+    async def prepare_verification(self, request: Any) -> Verifiable:
+        """Return what is to be verified.
+
+        :param request: the `Verify.Goal`.
+        :raises RelayAutotuneError: with the reason if the loop is not ready.
+        """
+        raise NotImplementedError
+
+    def move(self, setpoint: float, load: float) -> None:
+        """Put a step on the loop, in place of the one before; 0: none.
+
+        :param setpoint: added to the set-point [y].
+        :param load: added to the command [u].
+        """
+        raise NotImplementedError
+
+    def why_silent(self, silence: float) -> Reason:
+        """Return what it means that no command has come for a time.
+
+        :param silence: the time [s].
+        """
+        raise NotImplementedError
+
+
 class Verifier:
     """Make steps on a running loop and compare each with the prediction.
 
     The predictions take up to seconds, so they are computed in another thread.
 
     :param node: the node.
-    :param prepare: takes a request and returns what is to be verified; raises RelayAutotuneError
-        with the reason if the loop is not ready.
-    :param begin: begins the proof of what is to be verified; raises RelayAutotuneError if it
-        cannot. Nothing has changed before, and whatever comes after, `ended` is called.
-    :param move: adds a step to the set-point [y] and one to the command [u]; 0: no step.
-    :param ended: called with True if all steps passed, False if one failed, None without a
-        verdict; returns what became of the gains, for the sentence of the result.
-    :param silent: returns the reason where no command has come for a time [s].
     """
 
-    def __init__(
-        self,
-        node: ServedNode,
-        *,
-        prepare: Callable[[Any], Awaitable[Verifiable]],
-        begin: Callable[[Verifiable], Awaitable[None]],
-        move: Callable[[float, float], None],
-        ended: Callable[[bool | None], Awaitable[str]],
-        silent: Callable[[float], Reason],
-    ) -> None:
-        self._node, self._silent = node, silent
+    def __init__(self, node: ProvenNode) -> None:
+        self._node = node
         self.commands = CommandWatch()
         """What it hears of the commands."""
-        self._verifiable, self._on_trial, self._move, self._ended = prepare, begin, move, ended
         # Verdict and reason, once the proof has ended.
         self._over: tuple[bool | None, Reason] | None = None
         # Done at the next look, at the end of a step, and at that of the proof.
@@ -338,9 +351,9 @@ class Verifier:
             while (silence := self.commands.unsure()) is None:
                 await self._next()
             if silence:
-                passed, why = None, self._silent(silence)
+                passed, why = None, self._node.why_silent(silence)
         try:
-            became = await self._ended(passed)
+            became = await self._node.keeper.end_verification(passed)
         except Exception as error:  # noqa: BLE001
             became = f"; {_why(error)}"
         self._goal = None
@@ -350,12 +363,12 @@ class Verifier:
 
     async def _course(self, request: Any) -> tuple[bool | None, Reason]:
         """Put the gains on trial, make the steps, and return verdict and reason."""
-        tried = await self._verifiable(request)
+        tried = await self._node.prepare_verification(request)
         self._require_on()
         patience = request.patience
         await self._once_ready(self._require_samples, time.monotonic() + patience)
         if tried.new is not None:
-            await self._on_trial(tried)
+            await self._node.keeper.begin_verification(tried.new)
             self._require_on()
             shown = self._recent[-1][0] - self._recent[0][0]
             settles = tried.settles if math.isfinite(tried.settles) else shown
@@ -373,7 +386,7 @@ class Verifier:
         for step, planned in zip(tried.steps, plans, strict=True):
             planned.require_visible(step, noise)
         if tried.new is None:
-            await self._on_trial(tried)
+            await self._node.keeper.begin_verification(tried.new)
             self._require_on()
         self._begun, self._beyond = self._recent[-1][0], 0
         self._planned = 2.0 * sum(p.duration for p in plans)
@@ -384,7 +397,7 @@ class Verifier:
         for number, (step, planned) in enumerate(zip(tried.steps, plans, strict=True), 1):
             hole = max(_SILENT_INTERVALS * period, _LARGEST_HOLE * planned.duration)
             self._trial = trial = Trial(number, len(plans), step, planned, rest, hole)
-            self._move(step.setpoint, step.load)
+            self._node.move(step.setpoint, step.load)
             self._node.defer(self._narrator.now)
             while not trial.made:
                 await self._woken()
@@ -548,7 +561,7 @@ class Verifier:
                     self._end(False, Code.STEP_RAN_AWAY(away=away, most=trial.plan.runaway))
                 elif trial.is_over:
                     trial.made, trial.samples = tuple(trial.samples), []
-                    self._move(0.0, 0.0)
+                    self._node.move(0.0, 0.0)
                     self._wake_up()
             elif trial.is_over:
                 self._wake_up()
@@ -562,7 +575,7 @@ class Verifier:
     def why_silent(self) -> Reason | None:
         """Return a reason if the commands have stopped."""
         silence = self.commands.too_long()
-        return self._silent(silence) if silence else None
+        return self._node.why_silent(silence) if silence else None
 
     def out_of_range(self, measurement: float) -> None:
         """Take a measurement outside its range [y], which the controller did not answer."""
@@ -637,7 +650,7 @@ class Verifier:
         self._over = passed, why
         if self._trial is not None:
             self._trial = None
-            self._move(0.0, 0.0)
+            self._node.move(0.0, 0.0)
         # As a task, so that the executor wakes.
         self._node.executor.create_task(self._wake_up)
 
