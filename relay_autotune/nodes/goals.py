@@ -1,14 +1,14 @@
 # Copyright 2026 the developers of relay_autotune
 # SPDX-License-Identifier: Apache-2.0
 
-"""Services and actions: their goals, what they tell, how they end; the action ~/tune."""
+"""Services and actions: their goals, what they tell, how they end."""
 
 from __future__ import annotations
 
 import math
 import re
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse
@@ -18,9 +18,8 @@ from relay_autotune.errors import RelayAutotuneError
 from relay_autotune.exchange.messages import fill_reason
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.experiment.phases import State
-from relay_autotune.nodes import quality
 from relay_autotune.nodes.lifetime import STEADY, ServedNode
-from relay_autotune.reasons import Code, Reason
+from relay_autotune.reasons import Reason
 from relay_autotune.text import LOGGED_EVERY, PROGRESS_EVERY
 from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import TransferFunction
@@ -231,39 +230,3 @@ class TuneGoal:
         if not (judged.verdict_reason or given):
             result.verdict_why = result.why
         conclude(self._handle, result, succeeded=summary.outcome == Tune.Result.COMPLETED)
-
-
-def serve_tunes(
-    node: ServedNode,
-    ready: Awaitable[None],
-    start: Callable[[float, bool, TuneGoal], StartTune.Response],
-    cancel: Callable[[Any], None],
-) -> ActionServer:
-    """Serve the action. A tune may begin while the one before waits for its gains.
-
-    :param node: the node.
-    :param ready: done once a tune may be asked for.
-    :param start: takes an amplitude [u], whether it is a dry run, and the goal, which it keeps if
-        a tune has begun; says what became of it.
-    :param cancel: called with the handle of a goal that its client cancels.
-    """
-
-    async def begin(handle: Any) -> None:
-        request = handle.request
-        await ready
-        if handle.is_cancel_requested:
-            started = refused(Code.CANCELLED())
-        else:
-            started = start(request.amplitude, request.dry_run, TuneGoal(handle))
-        if not started.experiment_id:
-            said = {n: getattr(started, n) for n in ("reason", "why", "checks", "refusals")}
-            conclude(handle, Tune.Result(**said), succeeded=started.accepted)
-
-    return serve_goals(
-        node,
-        Tune,
-        "~/tune",
-        lambda handle: node.executor.create_task(begin, handle),
-        cancel,
-        status_pub_qos_profile=quality.STATUS,
-    )

@@ -22,7 +22,7 @@ from relay_autotune.exchange.messages import finding_from_message, set_stamp
 from relay_autotune.experiment.early_end import EarlyEnd
 from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.nodes import quality
-from relay_autotune.nodes.goals import Narrator, TuneGoal, refused, serve, serve_tunes
+from relay_autotune.nodes.goals import Narrator, TuneGoal, conclude, refused, serve, serve_goals
 from relay_autotune.nodes.lifetime import STEADY, ServedNode, run
 from relay_autotune.nodes.live_types import command_reader, reader_of
 from relay_autotune.nodes.loop_ends import LoopSupervisor
@@ -37,6 +37,7 @@ from relay_autotune.nodes.watch import Sensor, arrival
 from relay_autotune.reasons import Code, Reason
 from relay_autotune.record.record import Outcome
 from relay_autotune.text import duration
+from relay_autotune_msgs.action import Tune
 from relay_autotune_msgs.msg import PidGains, RelayCycle, TransferFunction
 from relay_autotune_msgs.msg import RelayExperiment as ExperimentMessage
 from relay_autotune_msgs.srv import StartTune
@@ -95,7 +96,14 @@ class RelayNode(ServedNode):
         waiting = ReentrantCallbackGroup()
         self.create_service(StartTune, "~/start_tune", self._on_start, callback_group=waiting)
         serve(self, Trigger, "~/abort", self._abort)
-        self._action = serve_tunes(self, self._arrival, self._request, self._cancel)
+        self._action = serve_goals(
+            self,
+            Tune,
+            "~/tune",
+            lambda handle: self.executor.create_task(self._on_goal, handle),
+            self._cancel,
+            status_pub_qos_profile=quality.STATUS,
+        )
         # The tune that runs, and before it those whose gains are awaited, by their ids.
         self._tunes: dict[str, Session] = {}
         # Of the newest tune.
@@ -178,6 +186,18 @@ class RelayNode(ServedNode):
     ) -> StartTune.Response:
         await self._arrival
         return self._request(request.amplitude, request.dry_run)
+
+    async def _on_goal(self, handle: Any) -> None:
+        """Take a goal. A tune may begin while the one before waits for its gains."""
+        request = handle.request
+        await self._arrival
+        if handle.is_cancel_requested:
+            started = refused(Code.CANCELLED())
+        else:
+            started = self._request(request.amplitude, request.dry_run, TuneGoal(handle))
+        if not started.experiment_id:
+            said = {n: getattr(started, n) for n in ("reason", "why", "checks", "refusals")}
+            conclude(handle, Tune.Result(**said), succeeded=started.accepted)
 
     def _request(
         self, amplitude: float, dry_run: bool, goal: TuneGoal | None = None
