@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -284,14 +285,9 @@ class Sensor:
         ]
         if not offered:
             return
-        self.subscription = self._subscribed(
-            QoSProfile(
-                history=profile.history,
-                depth=profile.depth,
-                durability=profile.durability,
-                reliability=ReliabilityPolicy.BEST_EFFORT,
-            )
-        )
+        weaker = copy(profile)
+        weaker.reliability = ReliabilityPolicy.BEST_EFFORT
+        self.subscription = self._subscribed(weaker)
         self._node.destroy_subscription(old)
         self._node.get_logger().info(
             f"{name} is taken best effort, as {who(offered[0])} offers it: samples that "
