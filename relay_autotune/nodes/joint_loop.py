@@ -310,17 +310,10 @@ def _of_trajectories(client: LoopClient, node: str) -> _Parts:
         if joint not in message.joint_names:
             return None
         place = list(message.joint_names).index(joint)
+        output = getattr(message.output, field)
+        told = message.reference.positions, message.feedback.positions, output
         # The output is left out where the interfaces cannot be read.
-        return DofState(
-            *(
-                float(values[place]) if place < len(values) else math.nan
-                for values in (
-                    message.reference.positions,
-                    message.feedback.positions,
-                    getattr(message.output, field),
-                )
-            )
-        )
+        return DofState(*(float(row[place]) if place < len(row) else math.nan for row in told))
 
     return _Parts(
         tuple(moved),
