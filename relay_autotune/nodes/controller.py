@@ -18,7 +18,6 @@ from typing import Any
 
 import yaml
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import SetBool, Trigger
@@ -102,8 +101,6 @@ def _topics(file: str) -> dict[str, str]:
     return {str(name): str(topic) for name, topic in topics}
 
 
-# How long the end of the process waits for the acknowledgement of its last message.
-ACKNOWLEDGE = Duration(seconds=0.2)
 NAMES_OF_GAINS = frozenset(entry.name for entry in tables.GAINS)
 # Interval of the looks at a proof, and for a sensor that only offers best effort [s].
 _LOOK_EVERY = 0.2
@@ -582,13 +579,13 @@ class ControllerNode(ProvenNode):
         self._ending = True
         self._verifier.interrupt(reason)
         if self._remote is not None:
-            self._remote.setpoints.publisher.wait_for_all_acked(ACKNOWLEDGE)
+            self._remote.setpoints.publisher.wait_for_all_acked(quality.ACKNOWLEDGE)
         elif self._commands.last is not None and not self._held:
             given = self.get_parameter("safe_command").value
             last = self._pid.command if math.isnan(rested) else rested
             safe = self._settings.limits.clip(last if math.isnan(given) else given)
             self._commands.send(safe)
-            self._commands.publisher.wait_for_all_acked(ACKNOWLEDGE)
+            self._commands.publisher.wait_for_all_acked(quality.ACKNOWLEDGE)
             self.get_logger().info(f"{reason}; the command is left at {safe:g}")
         if at_work:
             self._undo()

@@ -61,6 +61,9 @@ STATUS = QoSProfile(
 )
 """Profile of the status that shows whether a tune runs, and whether relay_node lives."""
 
+# How long the end of a process waits for the acknowledgement of its last message.
+ACKNOWLEDGE = Duration(seconds=0.2)
+
 # A node that was there before may be unknown until it next announces itself [s]: Fast DDS does so
 # every 3 s, and its publishers are known within some 0.1 s.
 ALL_KNOWN_AFTER = 3.5

@@ -14,7 +14,6 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.duration import Duration
 from std_srvs.srv import Trigger
 
 from relay_autotune.errors import FieldError, NotReadyError, ParameterError
@@ -42,8 +41,6 @@ from relay_autotune_msgs.msg import PidGains, RelayCycle, TransferFunction
 from relay_autotune_msgs.msg import RelayExperiment as ExperimentMessage
 from relay_autotune_msgs.srv import StartTune
 
-# How long the end of the process waits for the acknowledgement of the record.
-ACKNOWLEDGE = Duration(seconds=0.2)
 # Where a tune that was started by the service is seen.
 WATCH = "the log of {}, or the topic /diagnostics, which tell each second how it goes"
 # Number of latched cycles for late subscribers; max_cycles at the node's start if that is more.
@@ -421,7 +418,7 @@ class RelayNode(ServedNode):
             elif self._loop.held is not None:
                 self._send_safe(self._loop.held)
             self.work_off()
-            self._experiments.wait_for_all_acked(ACKNOWLEDGE)
+            self._experiments.wait_for_all_acked(quality.ACKNOWLEDGE)
         finally:
             for tune in [*self._tunes.values()]:
                 tune.recording.close(f"because {reason}")
