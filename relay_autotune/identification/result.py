@@ -232,8 +232,7 @@ class Identification:
     to_explain: float = math.nan
     # Models that each part of the record allows by itself.
     parts: tuple[Part, ...] = ()
-    # How well a model of the other direction that answers within the dead time explains as much, 0
-    # to about 1; 0 where the direction is known.
+    # How well models of the other direction explain the record, 0 to 1; 0 where it is known.
     opposed: float = 0.0
     # Returns the FOPDT that was fitted besides the model; None: there is none, or it is the model.
     plain: Callable[[], Identification | None] | None = None

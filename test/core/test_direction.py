@@ -11,11 +11,13 @@ from virtual_tune import tuned
 
 from relay_autotune.analysis import analyse
 from relay_autotune.experiment.parameters import ExperimentParameters
+from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.process.virtual_process import Plant
 from relay_autotune.record.record import Outcome, PiecewiseConstant, Record
 from relay_autotune.verdict import Result, Verdict
 
@@ -123,6 +125,26 @@ def test_half_a_period_more_of_dead_time_is_no_other_direction():
     assert results["direction"] is not Result.PASSED
     assert later.model.model.gain == pytest.approx(1.15, rel=0.03)
     assert later.model.opposed == 0.0
+
+
+def test_a_structure_that_cannot_grow_gets_no_gains_for_a_pendulum_that_is_held_upright():
+    """A stable model of the wrong sign had been trusted: it left 6 % of the measurement."""
+    rng, interval, rows = np.random.default_rng(1), 0.006, []
+    pendulum = Plant(TransferFunction(-1.0, (), (0.15, -0.15, 0.01), 0, 0.015))
+    command = push = total = smooth = 0.0
+    for time in interval * np.arange(1000):
+        angle = pendulum.advance(time, command + push) + 0.01 * rng.standard_normal()
+        push = 0.99 * push + 0.0028 * rng.standard_normal()
+        total += 0.4 * interval * angle
+        rate = 0.5 * (angle - smooth) / interval
+        smooth += rate * interval
+        command = -2.2 * (angle + total + 0.13 * rate)
+        rows.append((time, angle, command))
+    record = Record(*np.array(rows).T)
+    found = analyse(record, alone=True, known=Known(structure="sopdt"))
+    assert found.verdict is Verdict.NONE
+    results = {f.name: f.result for f in found.judgement.findings}
+    assert results["direction"] is Result.FAILED
 
 
 def test_a_step_from_a_known_command_begins_from_rest():

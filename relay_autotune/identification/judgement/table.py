@@ -150,7 +150,7 @@ def _direction(evidence: Evidence) -> Measured | None:
     ]
     if found.opposed:
         as_well = "a process of the other direction explains the record about as well"
-        shares.append((min(found.opposed, 1.0), as_well))
+        shares.append((found.opposed, as_well))
     return Measured(*max(shares)) if shares else None
 
 
@@ -169,7 +169,8 @@ MODEL_CHECKS = (
         name="direction",
         title="Direction",
         what="largest share of models of the other direction that the record, or a part of it, "
-        "allows; or how well one of them that answers within the dead time explains as much",
+        "allows; or how well one that answers within the dead time explains as much; or, in a "
+        "closed loop, how clearly a growing one explains more",
         unit="",
         doubtful=0.5,
         failed=0.9,

@@ -42,8 +42,8 @@ class Fit:
     :param loss: the loss that was minimised.
     :param warnings: sentences on what was left out.
     :param plain: fits the FOPDT beside the same terms to the end; None: there is none.
-    :param opposed: returns how well a model of the other direction explains as much; None: the
-        direction is known.
+    :param opposed: returns how well models of the other direction explain the record, 0 to 1;
+        None: the direction is known.
     """
 
     problem: Problem
