@@ -170,7 +170,7 @@ def main() -> int:
             positions = list(subject.positions(first))
             for asked in [] if ahead else positions[:6]:
                 subject.shaped(asked)
-            with served([subject], ahead=ahead) as url:
+            with served([subject]) as url:
                 tab = browser.tab()
                 tab.size(1280, 900)
                 tab.go(f"{url}#ms=1.2&controller=pid&rule=robust")

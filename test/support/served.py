@@ -56,7 +56,6 @@ def served(
     subjects: list[PageModel],
     address: Address | None = None,
     *,
-    ahead: bool = False,
     live: Live | None = None,
     lives: Sequence[Live] = (),
 ) -> Iterator[str]:
@@ -66,14 +65,12 @@ def served(
     :param address: where it is served.
     :param live: the loop that is watched.
     :param lives: the loops, if there are several.
-    :param ahead: whether what the slider may ask for is computed in between.
     """
     page = Page(
         subjects,
         address or Address(),
         [live] if live is not None else lives,
     )
-    page.computes_ahead = ahead
     with in_background(page) as url:
         yield url
 
