@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from relay_autotune.errors import ParameterError
-from relay_autotune.experiment.experiment import RelayExperiment
 from relay_autotune.quantities import NORMAL_95, result_field
 from relay_autotune.reasons import Code, Reason
+
+if TYPE_CHECKING:
+    from relay_autotune.experiment.experiment import RelayExperiment
 
 ULTIMATE_GAIN, MS = "ultimate_gain", "ms"
 SOUGHT = (ULTIMATE_GAIN, MS)
