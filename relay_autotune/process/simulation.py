@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -118,6 +118,7 @@ class HalfCycle:
 
 # More switches than this count as chatter.
 _MOST_SWITCHES = 20_000
+_QUADRATURE = np.polynomial.legendre.leggauss(8)
 
 
 @dataclass(frozen=True)
@@ -125,8 +126,7 @@ class RelayRun:
     """Result of an ideal relay experiment.
 
     :param command: the command with its exact switch instants.
-    :param cycles: every whole cycle, with exact times and peaks; the mean of the measurement is
-        that of straight lines.
+    :param cycles: every whole cycle, with exact times, peaks and means.
     :param output: returns the noise-free measurement at instants of the run [y].
     """
 
@@ -305,14 +305,18 @@ def _cycle(
     """Return a whole cycle by samples that hold its switches and extremes."""
     first = 2 * index + (1 if settings.reverse_acting else 2)
     begin, end = command.times[[first, first + 2]]
-    times, values = [], []
+    times, values, area = [], [], 0.0
+    nodes, weights = _QUADRATURE
     for piece in pieces:
         if begin <= piece.begin < end:
             at = piece.instants(piece.length)
             times.append(piece.begin + at)
             values.append(piece.output(at))
+            cell = 0.5 * np.diff(at)[:, None]
+            inner = piece.output((at[:-1, None] + cell * (nodes + 1.0)).ravel())
+            area += float(np.sum(inner.reshape(-1, nodes.size) * weights * cell))
     time = np.concatenate(times)
-    return cycle_from_samples(
+    cycle = cycle_from_samples(
         index,
         time,
         np.concatenate(values),
@@ -320,3 +324,4 @@ def _cycle(
         middle=settings.baseline + settings.bias,
         reverse_acting=settings.reverse_acting,
     )
+    return replace(cycle, mean_measurement=area / (end - begin))
