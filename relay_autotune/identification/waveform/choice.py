@@ -31,6 +31,7 @@ from relay_autotune.identification.waveform.candidates import (
     drop_first_dead_time,
     moves_seldom,
 )
+from relay_autotune.identification.waveform.direction import opposed
 from relay_autotune.identification.waveform.fit_covariance import Fit, raw_residual
 from relay_autotune.identification.waveform.problem import (
     NEGLIGIBLE,
@@ -48,7 +49,6 @@ from relay_autotune.identification.waveform.residuals import (
 from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Trial,
-    errors_in_simulation,
     information_criterion,
     refine,
     rms_in_simulation,
@@ -69,7 +69,6 @@ from relay_autotune.process.structures import (
     UNSTABLE_FOPDT,
     UNSTABLE_SOPDT,
 )
-from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.excitation import answering_time
 from relay_autotune.record.record import PiecewiseConstant
 from relay_autotune.text import digits
@@ -117,8 +116,6 @@ _ROWS, _AHEAD = 2.0, 20.0
 # Longest dead time as a share of the time after the first change of the command: what came later
 # has nothing to confirm it, and may be of the past.
 _LATEST = 0.5
-# Stretches of a record: enough for ranks, and each longer than its errors are correlated.
-_STRETCHES = 20
 
 
 class NoResponseError(IdentificationError):
@@ -198,99 +195,11 @@ def chosen_fit(
     *first, last = fits
     best = next((f for f in first if odds_of_response(f.problem, f.state) > ANSWERED), last)
     if not sign:
-        best = replace(best, opposed=partial(_opposed, few, best))
+        best = replace(best, opposed=partial(opposed, few, best))
     plain = next((c for c in own if c.structure == FOPDT), None)
     if plain is None or best.problem.structure == FOPDT:
         return best
     return replace(best, plain=partial(_fitted_to_all, plain, [], problem, scale))
-
-
-def _opposed(context: FitContext, fit: Fit) -> float:
-    """Return how well models of the other direction explain a record, beside a fit.
-
-    :param context: the samples.
-    :param fit: has the terms beside the model.
-    :return: 0 to 1, the larger of two; from 0.5 on the direction is open.
-    """
-    model = fit.problem.structure.model_at(fit.state.theta, fit.state.coefficients)
-    assert model is not None
-    white = replace(with_terms_of(fit.problem, context.problem), colour=None)
-    inside = replace(context, problem=white)
-    found = _answered_earlier(inside, fit, model) if model.dead_time > 0.0 else 0.0
-    return max(found, _outgrown(inside, fit, model)) if context.bounded else found
-
-
-def _answered_earlier(context: FitContext, fit: Fit, model: TransferFunction) -> float:
-    """Return how well a plain model that answers within the dead time of a fit explains as much.
-
-    To a command that is nearly periodic, a process and its reverse half a period later answer
-    alike. A short stretch, in which something else moved the measurement, may decide for the
-    later one, though so long a dead time is rare: so the medians of the errors are compared.
-
-    :param context: the samples, and the terms beside the model.
-    :param fit: of some of them.
-    :param model: of the fit, with a dead time.
-    :return: the smaller of two ratios, of the fit's error over the other's and of what the other
-        explains over what the fit does; 0 where there is none.
-    """
-    context = replace(context, problem=replace(context.problem, latest=model.dead_time))
-    own, total = _typical_squares(fit)
-    least = min(
-        (
-            _typical_squares(c)[0]
-            for c in context.best_of_direction(-model.process_sign)
-            if c.model.response_time < model.dead_time
-        ),
-        default=math.inf,
-    )
-    floor = NEGLIGIBLE**2
-    explained = max(total - least, 0.0) / max(total - own, floor)
-    return min(math.sqrt(own / max(least, floor)), explained, 1.0)
-
-
-def _outgrown(context: FitContext, fit: Fit, model: TransferFunction) -> float:
-    """Return how clearly a growing model explains more of a closed loop's record than a fit.
-
-    A controller that holds what would run away makes noise in whose colour a stable model can be
-    the likelier one. The errors in simulation tell: their squares in stretches of the record are
-    compared by Wilcoxon's signed ranks (1945), so that no single stretch decides.
-
-    :param context: the samples, and the terms beside the model.
-    :param fit: of some of them.
-    :param model: of the fit.
-    :return: the ranks of the stretches of which the growing one explains more, less those of the
-        others, over all (the rank-biserial correlation, Kerby 2014); 0 where it explains less, or
-        there is none of the other direction.
-    """
-    own = replace(context.problem, structure=fit.problem.structure)
-    left = _squares_in_stretches(own, fit.state)
-    found = [0.0]
-    for other in context.fit(name for name in TRIED if TABLE[name].unstable):
-        if other.model.process_sign != model.process_sign:
-            gain = left - _squares_in_stretches(other.problem, other.state)
-            ranks = np.argsort(np.argsort(np.abs(gain))) + 1.0
-            found.append(float(np.sign(gain) @ ranks / ranks.sum()))
-    return max(found)
-
-
-def _squares_in_stretches(problem: Problem, state: Trial) -> FloatArray:
-    """Return the mean squares that a model leaves in stretches of equal length.
-
-    :param problem: the samples.
-    :param state: a fit of these, or of some of them.
-    """
-    left, _ = errors_in_simulation(problem, state.coefficients, state.theta)
-    return np.array([np.mean(part**2) for part in np.array_split(left, _STRETCHES)])
-
-
-def _typical_squares(found: Candidate | Fit) -> tuple[float, float]:
-    """Return the median squares of what a model leaves in simulation, and is to explain.
-
-    :param found: with what was fitted.
-    """
-    parts = errors_in_simulation(found.problem, found.state.coefficients, found.state.theta)
-    left, total = (float(np.median(np.square(part))) for part in parts)
-    return left, total
 
 
 def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candidate]:
