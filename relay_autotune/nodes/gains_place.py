@@ -248,7 +248,7 @@ class RemoteController(_Place):
         """The last command received [u]; NaN before the first."""
         self.setpoint: float = values["initial_setpoint"]
         """The set-point in force [y]; NaN: not known."""
-        self.setpoints = CommandPublisher(node, setpoints, "setpoint")
+        self.setpoints = CommandPublisher(node, setpoints, "setpoint", heard=True)
         """Where its set-points go out."""
         self._disturbed, self._offset = disturbed, 0.0
         quality.subscription(node, setpoints.kind, "setpoint", self._on_setpoint, quality.COMMAND)

@@ -43,11 +43,18 @@ class CommandPublisher:
     :param node: the node.
     :param messages: writes them.
     :param topic: unresolved name of the topic.
+    :param heard: True: the node hears the topic, too, and asks which of its numbers are its own.
     :param options: of the publisher.
     """
 
     def __init__(
-        self, node: ServedNode, messages: CommandMessage, topic: str, **options: Any
+        self,
+        node: ServedNode,
+        messages: CommandMessage,
+        topic: str,
+        *,
+        heard: bool = False,
+        **options: Any,
     ) -> None:
         self.messages = messages
         self.publisher: Publisher = quality.publisher(
@@ -56,7 +63,7 @@ class CommandPublisher:
         self.topic: str = self.publisher.topic_name
         # Looked up once, because they are called for each measurement.
         self._written, self._publish = messages.written, self.publisher.publish
-        self._on_the_way: deque[float] = deque(maxlen=_OWN_KEPT)
+        self._heard, self._on_the_way = heard, deque[float](maxlen=_OWN_KEPT)
         self.last: float | None = None
         """The number published last; None: there was none."""
         self.is_fresh = False
@@ -67,7 +74,8 @@ class CommandPublisher:
         message = self._written(value)
         if message is None:
             return
-        self._on_the_way.append(self.messages.on_wire(value))
+        if self._heard:
+            self._on_the_way.append(self.messages.on_wire(value))
         self._publish(message)
         self.last, self.is_fresh = value, True
 
@@ -203,7 +211,10 @@ class LoopSupervisor:
         self._is_reported = bool(self._value("controller_command_field"))
         plain = CommandMessage() if self._is_reported else commands
         # /diagnostics and the answer to a start report an incompatible QoS.
-        self.command = CommandPublisher(node, plain, "command", **quality.OVERRIDABLE)
+        self._takeover = self._value("path") == "takeover"
+        self.command = CommandPublisher(
+            node, plain, "command", heard=self._takeover, **quality.OVERRIDABLE
+        )
         self.setpoint: CommandPublisher | None = None
         """Where set-points go out; None: the relay does not move them."""
         if self._value("relay_on") == "setpoint":
@@ -213,7 +224,6 @@ class LoopSupervisor:
         """Where the relay's levels go out."""
         self.own = self.relay if self._is_reported else self.command
         """Where the message goes out that the node was given, and that may have to be repeated."""
-        self._takeover = self._value("path") == "takeover"
         self.handover = BumplessTransfer(self.command.send)
         initial = self._value("initial_command")
         # The actuator is there already; the controller may be elsewhere.
