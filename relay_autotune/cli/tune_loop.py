@@ -272,7 +272,9 @@ class Session:
             if not self._may_start(loop, found):
                 return False
             if options.dry_run:
-                again = [word for word in options.typed if word != "--dry-run"]
+                # The option may have been abbreviated, as --dry.
+                dry = [w for w in options.typed if len(w) > 2 and "--dry-run".startswith(w)]
+                again = [word for word in options.typed if word not in dry]
                 if not options.json:
                     print(f"\nNext:\n  {'start it':<26} {prefix()}{shlex.join((PROGRAM, *again))}")
                 return True

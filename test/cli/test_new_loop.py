@@ -581,6 +581,19 @@ def test_a_tune_that_nobody_agrees_to_is_said_not_to_start(
     assert capsys.readouterr().err.endswith("expected y or n\ntune_loop: not started\n")
 
 
+@pytest.mark.parametrize("dry", ["--dry-run", "--dry"])
+def test_the_command_after_a_dry_run_starts_the_tune(
+    dry: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = SimpleNamespace(dry_run=True, json=False, typed=[dry, "--within", "30", "50"])
+    loop: Any = SimpleNamespace(
+        plan=list, check=lambda deadline: None, answers=SimpleNamespace(may_go_back=False)
+    )
+    session: Any = SimpleNamespace(options=given, _may_start=lambda loop, found: True)
+    assert tune_loop.Session._is_agreed(session, loop, math.inf)
+    assert capsys.readouterr().out.endswith("tune_loop --within 30 50\n")
+
+
 def test_units_that_are_typed_or_that_messages_say_stand_everywhere(
     typed: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
