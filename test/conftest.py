@@ -41,13 +41,12 @@ def pytest_addoption(parser):
 def pytest_collection_modifyitems(config, items):
     number = Counter()
     for item in items:
-        marked = item.get_closest_marker("by_day")
-        if item.get_closest_marker("nightly") or not (marked or config.option.first_cases):
-            continue
-        test = (item.path, item.parent.name, getattr(item, "originalname", item.name))
-        number[test] += 1
-        if number[test] > (1 if config.option.first_cases else marked.args[0]):
-            item.add_marker(pytest.mark.nightly)
+        first_alone = config.option.first_cases or item.get_closest_marker("long")
+        if first_alone and not item.get_closest_marker("nightly"):
+            test = (item.path, item.parent.name, getattr(item, "originalname", item.name))
+            number[test] += 1
+            if number[test] > 1:
+                item.add_marker(pytest.mark.nightly)
     of_browsers = [item for item in items if item.get_closest_marker("browser")]
     if not of_browsers:
         return

@@ -143,6 +143,7 @@ def test_one_that_declares_too_much_takes_no_memory(tmp_path):
     )
 
 
+@pytest.mark.long
 def test_many_large_ones_are_not_in_memory_together(tmp_path):
     squeeze = zstandard.ZstdCompressor().compress
     large = [squeeze(encode_float64(float(k)) + bytes(10 << 20)) for k in range(30)]

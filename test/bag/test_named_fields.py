@@ -70,7 +70,7 @@ def joints(kind, names, position, velocity=()):
     )
 
 
-@pytest.mark.by_day(1)
+@pytest.mark.long
 @pytest.mark.parametrize("little", [True, False])
 def test_a_thousand_orders_never_give_a_wrong_element(little):
     rng = np.random.default_rng(5)

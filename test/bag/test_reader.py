@@ -253,7 +253,7 @@ def test_a_bag_cut_before_the_first_sample(tmp_path):
         read_experiments(tmp_path / "bag")
 
 
-@pytest.mark.by_day(1)
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("compression", "step"),
     [
@@ -348,6 +348,7 @@ def test_a_damaged_chunk_is_left_out_and_said(tmp_path):
     assert any("is damaged at byte" in n and "checksum" in n for n in recording.notes)
 
 
+@pytest.mark.long
 @given(data=st.data())
 @settings(max_examples=150, deadline=None)
 def test_flipped_bytes_never_break_the_reader(data, tmp_path_factory):
@@ -437,6 +438,7 @@ def held(times, values, at):
     return np.array([values[np.flatnonzero(times <= t)[-1]] for t in at])
 
 
+@pytest.mark.long
 @given(data=st.data())
 @settings(max_examples=80, deadline=None)
 def test_the_input_of_a_foreign_pair_equals_its_commands(data, tmp_path_factory):

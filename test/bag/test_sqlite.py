@@ -165,6 +165,7 @@ def test_columns_that_are_computed_are_refused(tmp_path):
     assert "a table messages with columns that are computed" in said
 
 
+@pytest.mark.long
 def test_more_topics_than_a_recorder_has_are_refused(tmp_path):
     said = refused(
         bag(tmp_path / "a.db3"),
@@ -174,6 +175,7 @@ def test_more_topics_than_a_recorder_has_are_refused(tmp_path):
     assert "declares more than 50000 topics" in said
 
 
+@pytest.mark.long
 def test_many_topics_take_no_longer_and_are_not_paired(tmp_path):
     path = bag(tmp_path / "a.db3")
     database = sqlite3.connect(path)

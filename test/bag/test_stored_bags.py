@@ -67,6 +67,7 @@ def test_the_samples_are_those_that_were_recorded(name):
     assert (len(record), digest.hexdigest()[:16]) == SAMPLES[name]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", FOUND)
 def test_the_process_is_found_again(name):
     said, true, tolerance = FOUND[name]

@@ -182,6 +182,7 @@ _NOTHING = struct.pack("<BQ", 0x80, 0)
 _MESSAGE = struct.pack("<BQHIQQ", 5, 34, 1, 0, START, START) + encode_float64(1.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("records", "said"),
     [
@@ -229,6 +230,7 @@ def test_messages_of_many_channels_take_no_longer(tmp_path):
     assert any("channels that it does not declare" in note for note in notes)
 
 
+@pytest.mark.long
 def test_messages_between_records_of_no_use_take_no_longer(tmp_path):
     """All that follows was looked at for each of them: a file of 2 MB took half an hour."""
     path = tmp_path / "a.mcap"
@@ -349,6 +351,7 @@ def without_summary(data):
     return data[:foot] + bytes(20) + data[foot + 20 :]
 
 
+@pytest.mark.long
 @given(
     turns=st.lists(st.tuples(st.integers(0, 2), st.integers(0, 60)), min_size=1, max_size=80),
     chunk_size=st.sampled_from((1, 90, 700, 10**6)),
@@ -432,7 +435,7 @@ def test_message_indexes_of_other_topics_are_not_read(tmp_path):
 # --- valid framing that lies inside it
 
 
-@pytest.mark.by_day(2)
+@pytest.mark.long
 @pytest.mark.parametrize("part", range(4))
 def test_bags_that_lie(tmp_path, part):
     seeds = fuzz_framing.seeds_once()

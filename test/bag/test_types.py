@@ -305,6 +305,7 @@ def at_path(message, path):
     return float(message)
 
 
+@pytest.mark.long
 @given(text=definitions(), seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=60, deadline=None)
 def test_every_number_of_any_type(text, seed):
@@ -335,6 +336,7 @@ def plain(value):
     return [plain(item) for item in value] if isinstance(value, (list, np.ndarray)) else value
 
 
+@pytest.mark.long
 @given(text=definitions(), seed=st.integers(0, 2**32 - 1), cut=st.integers(1, 4))
 @settings(max_examples=60, deadline=None)
 def test_whole_messages_of_any_type(text, seed, cut):

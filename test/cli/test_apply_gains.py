@@ -93,6 +93,7 @@ def test_old_and_new_gains_stand_side_by_side_with_what_they_do() -> None:
     assert float(error.split()[6]) == pytest.approx(GAINS.iae_load, rel=1e-2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", ["oscat_ft_pid", "control_toolbox_legacy", "simple_pid"])
 def test_the_same_gains_do_the_same_by_the_law_of_the_new_ones(law: str) -> None:
     """Continuously their overshoot and Ms were others: the comparison told a change of nothing."""

@@ -98,6 +98,7 @@ def test_what_pid_controller_gets():
     }
 
 
+@pytest.mark.long
 def test_an_export_says_what_was_predicted(capsys):
     asked = ["--law", "ardupilot_rate", "--pid", "--noise-std", "0.02", "--amplitude", "0.5"]
     for how in ("ardupilot_rate", "yaml"):
@@ -238,6 +239,7 @@ def test_numbers_of_numpy_are_written_like_any_other():
     assert "float64" not in text
 
 
+@pytest.mark.long
 def test_replay_exports_the_gains_of_a_recording(capsys):
     bag = "bags/biased_relay"
     asked = ["--rule", "imc", "--loop-delay", "0.5", "--export", "pid_controller", "--dof", "oven"]
@@ -271,6 +273,7 @@ def settings_of(text: str) -> dict[str, str]:
     return {name: value for name, value in found if not name.startswith("_")}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [n for n, law in LAWS.items() if not law.sets_gains])
 def test_a_law_gets_its_settings_in_the_words_of_its_program(name, capsys):
     limits = ["--command-min", "0", "--command-max", "1"] * bool(LAWS[name].unset)
@@ -540,6 +543,7 @@ def test_a_program_starts_from_the_command_at_which_the_process_rests(law, name,
     assert factor * float(found[name]) == pytest.approx(0.35)
 
 
+@pytest.mark.long
 def test_replay_writes_the_gains_for_the_cycle_that_the_recording_shows(tmp_path, capsys):
     file = tmp_path / "fb.txt"
     asked = ["--export", "iec_61131_3_pid", "-o", str(file), "bags/step_test"]

@@ -70,6 +70,7 @@ def links(folder, count):
     return paths
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("more", [(), ("--jobs", "2")], ids=["one", "two"])
 def test_a_folder_of_bags_is_a_table_with_a_line_each(tmp_path, capsys, more):
     links(tmp_path, 2)
@@ -171,6 +172,7 @@ def test_a_bag_whose_process_died_for_another_reason_is_done_in_the_end(tmp_path
     assert found[-1][0] == 2 and all(done.status == 0 for _, done in found)
 
 
+@pytest.mark.nightly
 def test_a_process_that_forks_others_is_started_again_when_it_is_killed(tmp_path):
     found = in_processes(jobs(3, tmp_path), 1, mark)
     assert next(found)[1].status == 0
@@ -181,6 +183,7 @@ def test_a_process_that_forks_others_is_started_again_when_it_is_killed(tmp_path
     assert len(list(in_processes(jobs(3, tmp_path), 2, mark))) == 3
 
 
+@pytest.mark.nightly
 def test_a_cluster_of_which_a_worker_is_killed_loses_nothing_and_does_nothing_twice(
     tmp_path, monkeypatch
 ):
@@ -210,6 +213,7 @@ def is_running(number):
         return False
 
 
+@pytest.mark.nightly
 def test_the_bags_of_a_scheduler_that_dies_are_not_done(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr("relay_autotune.cli.fleet._CONNECT_S", 5.0)
@@ -241,6 +245,7 @@ def test_the_bags_of_a_scheduler_that_dies_are_not_done(tmp_path, monkeypatch):
             process.wait()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_no_worker_is_left_when_the_command_is_ended(tmp_path, number):
     code = (
@@ -296,6 +301,7 @@ def test_a_run_that_was_cut_short_goes_on(tmp_path, capsys):
     assert output.read_bytes().startswith(whole)
 
 
+@pytest.mark.long
 def test_a_bad_bag_leaves_a_row_with_its_reason(tmp_path, capsys):
     output = tmp_path / "out.csv"
     run(capsys, STEP, tmp_path / "none", "--output", output)

@@ -39,6 +39,7 @@ def model_of(arguments: str) -> dict:
     return json.loads(done.stdout)
 
 
+@pytest.mark.long
 def test_the_papers_example_as_a_table():
     words = f"--method chang {EXAMPLE} --dead-time 10 --gain 1.65".split()
     done = subprocess.run(
@@ -50,6 +51,7 @@ def test_the_papers_example_as_a_table():
     assert "0.1837 rad/s" in done.stdout
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("method", "tau"), [("chang", 20.0), ("atv", 16.2015903238), ("li", 20.0)]
 )

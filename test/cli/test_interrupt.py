@@ -47,6 +47,7 @@ def interrupted(name: str, words: list[str], delay: float) -> tuple[int, str]:
     return process.returncode, said
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("moments", [2, pytest.param(8, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize(
     ("name", "words", "ends"),
@@ -99,6 +100,7 @@ def test_ctrl_c_as_a_prompt_appears_is_heeded():
         os.close(window)
 
 
+@pytest.mark.long
 def test_ctrl_c_while_the_processes_of_a_fleet_load_is_no_traceback(tmp_path):
     # What the fork server loads first interrupts it there.
     (tmp_path / "loaded_first.py").write_text(
@@ -120,6 +122,7 @@ def test_ctrl_c_while_the_processes_of_a_fleet_load_is_no_traceback(tmp_path):
     assert done.stderr.count("does not exist") == 2
 
 
+@pytest.mark.long
 def test_one_that_is_not_to_be_interrupted():
     """Whoever starts a command with SIGINT ignored, as nohup and `&` in a script do, means it."""
     code = (

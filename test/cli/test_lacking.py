@@ -23,6 +23,7 @@ sys.exit({1}())
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "words", "absent", "told"),
     [
@@ -45,6 +46,7 @@ def test_a_missing_package_is_told_in_one_line(name, words, absent, told, tmp_pa
     assert "defect" not in done.stderr
 
 
+@pytest.mark.long
 def test_the_help_of_csv_to_bag_needs_nothing_of_its_extra() -> None:
     code = WITHOUT.format(["yaml"], "csv_to_bag")
     done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True)
@@ -52,6 +54,7 @@ def test_the_help_of_csv_to_bag_needs_nothing_of_its_extra() -> None:
     assert "--measurement-topic" in done.stdout
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["identify", "tune_loop", "plant_node"])
 def test_a_help_that_cannot_be_written_is_told_and_is_no_success(name) -> None:
     with Path("/dev/full").open("w") as full:

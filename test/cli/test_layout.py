@@ -41,6 +41,7 @@ def check_widths(printed):
     assert printed[80].split() == printed[99].split()
 
 
+@pytest.mark.long
 def test_the_result_of_a_recording_fits_the_terminal_and_no_word_is_broken():
     found = replace(completed(), reason="the file /home/somebody/of-a-tank.csv says so " * 3)
     check_widths({columns: table("bag", [found], columns) for columns in (80, 99)})

@@ -150,6 +150,7 @@ def test_the_document_has_the_numbers_of_the_core_to_the_last_digit(tmp_path, ca
     assert cycle["cycles"] >= 3
 
 
+@pytest.mark.nightly
 def test_two_experiments_are_two_entries_of_one_document(tmp_path, capsys):
     write_bag(tmp_path / "bag", tmp_path, relay_record(name="a"), relay_record(name="b"))
     _, out, _ = run(capsys, "--json", *QUICK, tmp_path / "bag")
@@ -160,6 +161,7 @@ def test_two_experiments_are_two_entries_of_one_document(tmp_path, capsys):
     assert "experiment 2 of 2" in out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "outcome", [Outcome.ABORTED, pytest.param(Outcome.FAILED, marks=pytest.mark.nightly)]
 )
@@ -185,6 +187,7 @@ def test_an_experiment_that_did_not_end_well_has_a_model_but_no_gains(tmp_path, 
     assert "ISA form" not in out
 
 
+@pytest.mark.long
 def test_a_bag_of_a_killed_node_gives_a_model_and_no_gains(tmp_path, capsys):
     record = relay_record()
     text = definition(CYCLE, tmp_path).text
@@ -207,6 +210,7 @@ def test_a_bag_of_a_killed_node_gives_a_model_and_no_gains(tmp_path, capsys):
     assert experiment["models"][0]["gain"] == pytest.approx(1.65, rel=0.03)
 
 
+@pytest.mark.long
 def test_a_foreign_recording_of_a_relay(tmp_path, capsys):
     record = relay_record()
     write_pair(
@@ -224,6 +228,7 @@ def test_a_foreign_recording_of_a_relay(tmp_path, capsys):
     assert experiment["gains"]
 
 
+@pytest.mark.long
 def test_other_methods_and_rules(tmp_path, capsys):
     write_bag(tmp_path / "bag", tmp_path, relay_record())
     _, out, _ = run(capsys, "--json", "--method", "wang_biased", "--rule", "imc", tmp_path / "bag")
@@ -232,6 +237,7 @@ def test_other_methods_and_rules(tmp_path, capsys):
     assert experiment["gains"][experiment["recommended"]]["rule"] == "imc"
 
 
+@pytest.mark.long
 def test_one_bad_bag_does_not_stop_the_others(tmp_path, capsys):
     good = write_bag(tmp_path / "good", tmp_path, relay_record())
     status, out, err = run(capsys, "--json", *QUICK, tmp_path / "none", good)
@@ -259,6 +265,7 @@ def step_csv(path, count=400, interval=0.5):
     return path
 
 
+@pytest.mark.long
 def test_a_csv_and_the_bag_made_of_it_give_equal_numbers(tmp_path, capsys):
     path = step_csv(tmp_path / "step.csv")
     columns = ("--time", "Time (s)", "--measurement", "Level [m]", "--command", "Valve (%)")
@@ -281,6 +288,7 @@ def test_a_csv_and_the_bag_made_of_it_give_equal_numbers(tmp_path, capsys):
     assert model["dead_time"] == pytest.approx(10.0, abs=0.3)
 
 
+@pytest.mark.long
 def test_the_interval_of_a_csv_is_that_period_however_its_times_are_rounded(tmp_path, capsys):
     path = step_csv(tmp_path / "step.csv", interval=0.1)
     status, out, _ = run(capsys, "--json", *FOPDT, "--rule", "imc", "--sample-period", "0.1", path)
@@ -292,6 +300,7 @@ def test_the_interval_of_a_csv_is_that_period_however_its_times_are_rounded(tmp_
     assert "the interval of the recording" in found["gains"][0]["reason"]
 
 
+@pytest.mark.long
 def test_gains_for_a_period_in_milliseconds_do_not_blame_the_recording(tmp_path, capsys):
     path = step_csv(tmp_path / "step.csv")
     asked = ("--export", "oscat_ft_pid", "--sample-period", "500")
@@ -301,6 +310,7 @@ def test_gains_for_a_period_in_milliseconds_do_not_blame_the_recording(tmp_path,
     assert "is the sampling period in seconds?" in err and "record for longer" not in err
 
 
+@pytest.mark.long
 def test_a_csv_with_more_columns_gives_the_lines_to_copy(tmp_path, capsys):
     rows = step_csv(tmp_path / "step.csv").read_text().splitlines()
     path = tmp_path / "of five.csv"
@@ -351,6 +361,7 @@ def test_columns_of_two_loops_are_paired_by_their_tag(tmp_path):
     assert (log.measurement.name, log.command.name) == ("TIC-101.PV", "TIC-101.OUT")
 
 
+@pytest.mark.long
 def test_everything_is_told_in_the_units_of_the_recording(tmp_path, capsys, monkeypatch):
     rows = step_csv(tmp_path / "step.csv").read_text().splitlines()
     rows[0] = "Time (s),PV [°C],OP [%],Extra"
@@ -550,6 +561,7 @@ def process(*arguments, **options):
     )
 
 
+@pytest.mark.nightly
 def test_two_processes_print_the_same_bytes(tmp_path, capsys):
     bag = write_bag(tmp_path / "bag", tmp_path, relay_record())
     asked = ("--json", *FOPDT, bag)
@@ -584,6 +596,7 @@ def test_nothing_is_imported_that_a_bag_of_ours_does_not_need(tmp_path):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.nightly
 def test_a_reader_that_leaves_early_gets_no_traceback(tmp_path):
     write_bag(tmp_path / "bag", tmp_path, relay_record())
     command = f"{sys.executable} -c '{_REPLAY}' {' '.join(QUICK)} {tmp_path}/bag | true"

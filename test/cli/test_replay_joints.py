@@ -30,6 +30,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> str:
     )
 
 
+@pytest.mark.nightly
 def test_each_joint_of_a_bag_is_a_row_with_its_own_model(bag: str, tmp_path: Path) -> None:
     rows = tmp_path / "rows.csv"
     joints = [word for joint in JOINTS[:2] for word in ("--joint", joint)]
@@ -43,6 +44,7 @@ def test_each_joint_of_a_bag_is_a_row_with_its_own_model(bag: str, tmp_path: Pat
         assert float(row["kc"]) > 0.0
 
 
+@pytest.mark.long
 def test_a_joint_of_a_bag_becomes_a_file_for_its_controller(
     bag: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

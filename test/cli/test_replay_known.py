@@ -51,6 +51,7 @@ def run(capsys, *arguments) -> tuple[int, list[dict], str]:
     return status, [json.loads(line) for line in out.splitlines()], err
 
 
+@pytest.mark.long
 def test_known_facts_reach_the_method(tmp_path, capsys):
     record = unbiased()
     bag = write_bag(tmp_path / "bag", tmp_path, record)
@@ -107,6 +108,7 @@ def test_what_a_method_is_declared_not_to_use_changes_nothing(method):
             identify(record, method, known)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("one_bag", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_two_tests_give_one_model(tmp_path, capsys, one_bag):
     records = unbiased(), unbiased(8.0)
@@ -135,6 +137,7 @@ def test_one_test_is_not_enough(tmp_path, capsys):
     assert "none" in found["error"]
 
 
+@pytest.mark.long
 def test_tests_that_were_aborted_give_no_gains():
     records = unbiased(), replace(unbiased(8.0), outcome=Outcome.ABORTED, reason="a hand did it")
     found = analyse_jointly(records, method="li")
@@ -143,6 +146,7 @@ def test_tests_that_were_aborted_give_no_gains():
     assert found.reason == "the experiment was aborted: no gains. a hand did it"
 
 
+@pytest.mark.long
 def test_rules_for_fopdt_take_that_of_the_method():
     known = Known(structure="fopdt")
     found = analyse_jointly((unbiased(), unbiased(8.0)), method="li", rule="simc", known=known)

@@ -45,6 +45,7 @@ def write_csv(path) -> None:
     path.write_text("time,measurement,command\n" + "\n".join(rows) + "\n")
 
 
+@pytest.mark.long
 def test_a_recording_becomes_a_page_and_figures(capsys, tmp_path, monkeypatch) -> None:
     only(monkeypatch, "experiment", "fit")
     asked = []
@@ -73,6 +74,7 @@ def test_a_recording_becomes_a_page_and_figures(capsys, tmp_path, monkeypatch) -
     assert "<title>Tank 7</title>" in page.read_text()
 
 
+@pytest.mark.long
 def test_several_recordings_of_one_process_have_one_model(capsys, tmp_path, monkeypatch) -> None:
     only(monkeypatch, "uncertainty")
     asked = []
@@ -90,6 +92,7 @@ def test_several_recordings_of_one_process_have_one_model(capsys, tmp_path, monk
     assert asked == [(2, "li")]
 
 
+@pytest.mark.long
 def test_results_of_several_recordings_share_a_page(capsys, tmp_path, result, monkeypatch) -> None:
     only(monkeypatch, "uncertainty")
     status, _, err = run(capsys, result, "-o", tmp_path / "page.html")
@@ -149,6 +152,7 @@ def test_what_does_not_fit_is_said_in_a_line(
     assert err.count("\n") == 1
 
 
+@pytest.mark.long
 def test_replay_writes_the_report_beside_its_table(capsys, tmp_path, monkeypatch) -> None:
     only(monkeypatch, "uncertainty")
     monkeypatch.setattr("relay_autotune.cli.jobs.analyse", lambda record, **_: completed())
@@ -161,6 +165,7 @@ def test_replay_writes_the_report_beside_its_table(capsys, tmp_path, monkeypatch
     assert "does not say what the report is to be" in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", [replay, report])
 def test_a_recording_that_gave_nothing_stands_in_the_report_of_several(
     tmp_path, monkeypatch, command

@@ -63,6 +63,7 @@ def test_gains_of_one_rule(capsys):
     assert found["reason"] == wanted.reason
 
 
+@pytest.mark.long
 def test_all_rules_side_by_side(capsys):
     _, out, _ = run(capsys, FOPDT, "--table")
     for name in RULES:
@@ -202,6 +203,7 @@ def test_people_may_write_a_document_too(tmp_path):
         assert model_of(tune._parser().parse_args([str(path)])) == model
 
 
+@pytest.mark.long
 def test_forms(capsys):
     flags = "--gain 1 --time-constants 10 3 --dead-time 1 --rule simc --pid"
     _, out, _ = run(capsys, flags, "--form series")
@@ -219,6 +221,7 @@ def test_forms(capsys):
         assert status == 0
 
 
+@pytest.mark.long
 def test_of_all_rules_one_without_the_form_is_told_as_such(capsys, tmp_path):
     # (1 + 0.5 s)/((1 - s)(1 + 0.1 s)) with a dead time of 0.1 s
     path = tmp_path / "model.json"
@@ -374,6 +377,7 @@ def test_help_names_every_option_and_fits(capsys):
         assert flag in out
 
 
+@pytest.mark.long
 def test_compensators_stand_beside_the_rules(capsys):
     _, out, _ = run(capsys, "--gain 1.5 --time-constants 10 --order 5 --table")
     assert re.search(r"high_order_compensator +4\.500 +26\.3", out)

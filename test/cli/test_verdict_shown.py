@@ -9,6 +9,7 @@ import json
 from dataclasses import replace
 from types import SimpleNamespace
 
+import pytest
 from analysed import completed, doubted
 from report_cases import only
 
@@ -104,6 +105,7 @@ def test_it_is_said_why_a_rival_of_more_support_is_not_taken(monkeypatch):
         assert (said.capitalize() in page([case])) == told
 
 
+@pytest.mark.long
 def test_the_period_of_the_controller_is_said_with_the_gains():
     record = completed().record
     own = completed().best_gains.reason

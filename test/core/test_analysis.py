@@ -145,6 +145,7 @@ def test_a_model_inside_takes_the_dead_time_out_of_the_loop():
     assert found.ms == pytest.approx(np.abs(1.0 - inside).max(), rel=1e-6)
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=60)
 @given(
     zeros=st.lists(st.floats(-3.0, 3.0).filter(lambda z: abs(z) > 0.1), max_size=1),

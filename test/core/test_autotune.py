@@ -63,13 +63,14 @@ def test_a_completed_experiment_yields_models_and_gains():
     assert len(found.cycles) >= 3
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_the_chosen_method_and_rule_come_first():
     found = _analysed("wang_biased", "imc")
     assert found.model.method == "wang_biased"
     assert found.best_gains.rule == "imc"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("outcome", [Outcome.ABORTED, Outcome.FAILED])
 def test_an_experiment_that_did_not_complete_yields_no_gains(outcome):
     ended = replace(_record(), outcome=outcome, reason="the operator said stop")
@@ -139,7 +140,7 @@ def test_unknown_names_are_refused_at_once():
 
 
 @pytest.mark.long
-@pytest.mark.by_day(3)
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["noise", "two level", "constant", "ramp", "huge", "walk"])
 @settings(deadline=None, max_examples=3)
 @given(

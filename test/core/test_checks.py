@@ -85,6 +85,7 @@ def test_two_amplitudes_tell_a_gain_that_hangs_on_them(seed):
     assert unequal_amplitudes(alike, MODEL) is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(5))
 def test_a_linear_process_raises_no_alarm(seed):
     record = _record(1.0, seed=seed)
@@ -92,6 +93,7 @@ def test_a_linear_process_raises_no_alarm(seed):
     assert (found.warnings, found.began_away) == ((), False)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("baseline", "before"), [(3.0, ()), (2.0, ((3.3, 15.0), (0.7, 12.0), (3.3, 9.0)))],
     ids=["wrong baseline", "restarted"],
@@ -115,6 +117,7 @@ def test_a_start_away_from_rest_is_named_and_is_no_other_gain(baseline, before):
     assert not any("not linear" in told for told in found.warnings)
 
 
+@pytest.mark.long
 def test_a_record_that_begins_within_the_relay_raises_no_alarm():
     settings = RelaySettings(setpoint=0.0, baseline=0.0, amplitude=1.0, bias=0.2, hysteresis=0.05)
     noise = 0.01 * np.random.default_rng(0).standard_normal(1000)
@@ -124,6 +127,7 @@ def test_a_record_that_begins_within_the_relay_raises_no_alarm():
     assert (found.warnings, found.began_away) == ((), False)
 
 
+@pytest.mark.long
 def test_an_actuator_that_pulls_less_than_it_pushes_is_told():
     found = identify_waveform(_record(0.6), Known(structure="fopdt"))
     above, below = found.effects
@@ -137,6 +141,7 @@ def test_an_actuator_that_pulls_less_than_it_pushes_is_told():
     assert max(gains) > 0.95 * MODEL.gain
 
 
+@pytest.mark.long
 def test_unequal_effects_that_are_shown_as_equal_are_no_news():
     found = identify_waveform(_record(0.995, noise=1e-4), Known(structure="fopdt"))
     above, below = found.effects
@@ -145,6 +150,7 @@ def test_unequal_effects_that_are_shown_as_equal_are_no_news():
     assert not any("not linear" in told for told in found.warnings)
 
 
+@pytest.mark.long
 def test_unequal_effects_within_the_interval_of_the_gain_are_no_news():
     found = identify_waveform(_record(0.95, noise=0.05), Known(structure="fopdt"))
     above, below = found.effects
@@ -153,6 +159,7 @@ def test_unequal_effects_within_the_interval_of_the_gain_are_no_news():
     assert not any("not linear" in told for told in found.warnings)
 
 
+@pytest.mark.long
 def test_the_same_relay_on_a_model_acts_unequally_as_the_record_does():
     """The period of two equal effects is 8 % shorter, which spoke against the right model."""
     record = _record(0.6)

@@ -41,6 +41,7 @@ def _record(model: TransferFunction, noise_std: float, seed: int) -> Record:
     return experiment.record()
 
 
+@pytest.mark.nightly
 def test_a_first_swing_much_longer_than_the_cycles_does_not_turn_the_gain():
     model = TransferFunction.sopdt(2.0, (2.0, 0.99), 0.01)
     record = _record(model, 5e-4, 0)

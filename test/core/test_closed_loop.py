@@ -125,6 +125,7 @@ def test_a_period_or_limits_without_sense_are_refused():
         simulate_closed_loop(PI, MODEL, period=1.0, duration=1.0, low=1.0, high=1.0)
 
 
+@pytest.mark.long
 def test_the_integrated_error_is_that_of_the_samples():
     run = simulate_closed_loop(PI, MODEL, period=0.1, duration=300.0, load=1.0)
     iae = float(np.sum(np.abs(run.measurement)) * 0.1)

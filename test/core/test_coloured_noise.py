@@ -151,6 +151,7 @@ def test_correlated_noise_beside_a_relay_test(pole, seed):
     assert abs(found.ultimate_gain - true.gain) < 3.5 * found.ultimate_gain_std
 
 
+@pytest.mark.nightly
 def test_structures_are_weighted_by_akaikes_criterion():
     rng = np.random.default_rng(5)
     record = relay_test(0.09 * correlated(0.9, 1400, rng), np.zeros(1400))
@@ -164,7 +165,7 @@ def test_structures_are_weighted_by_akaikes_criterion():
     assert max(support(stable)[1:]) > 0.1  # a richer structure counts beside the chosen FOPDT
 
 
-@pytest.mark.by_day(1)
+@pytest.mark.long
 @pytest.mark.parametrize(("structure", "seed"), [("fopdt", 0), ("", 0), ("", 1)])
 def test_a_load_that_walks_at_random_beside_a_relay_test(structure, seed):
     """A tenth of the error of least squares, which bends gain and dead time to the load."""
@@ -179,6 +180,7 @@ def test_a_load_that_walks_at_random_beside_a_relay_test(structure, seed):
     assert error < 3.5 * found.ultimate_gain_std
 
 
+@pytest.mark.nightly
 def test_a_heater_that_is_switched_on_with_the_first_sample():
     """The command before is nowhere in the record, nor is the dead time before it acts."""
     time = np.arange(900.0)
@@ -195,6 +197,7 @@ def test_a_heater_that_is_switched_on_with_the_first_sample():
     assert np.all(np.isfinite(found.fitted))
 
 
+@pytest.mark.nightly
 def test_an_oven_that_rests_and_then_warms_has_a_positive_gain():
     """A single step beside a slow disturbance, which once passed for a drift and a zero."""
     time = np.arange(1200.0)
@@ -291,6 +294,7 @@ def fitted_to_one_step() -> Problem:
     return problem_of([(time, response(PROCESS, time, u), u)], FOPDT)
 
 
+@pytest.mark.nightly
 def test_without_spikes_the_search_goes_on_from_what_was_found():
     """From the beginning it would end with fewer terms, or with a colour in their place."""
     time = PERIOD * np.arange(600)
@@ -527,6 +531,7 @@ def test_a_drift_alone_shows_none():
     assert "no response" in found.reason
 
 
+@pytest.mark.nightly
 def test_a_furnace_that_radiates_over_a_large_range_is_no_record_without_a_response():
     """Its best models of few parameters began later than it did: all of them were left out."""
     step, moves = 0.2, np.repeat([38.0, 50.0, 24.0], 552)

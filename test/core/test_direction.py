@@ -90,6 +90,7 @@ def test_what_a_disturbance_leaves_does_not_speak_for_the_other_direction(acting
     assert found.best_gains is not None
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("zero", "before"), [(-8.0, 4), (6.0, 2)])
 def test_a_step_that_begins_with_the_record_keeps_its_direction(zero, before):
     """A command or a movement just before the record had stood for the zero, 30 times as large."""
@@ -105,6 +106,7 @@ def test_a_step_that_begins_with_the_record_keeps_its_direction(zero, before):
     assert found.model.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.1)
 
 
+@pytest.mark.nightly
 def test_half_a_period_more_of_dead_time_is_no_other_direction():
     """The first answers came late, for which a model of the wrong sign had been trusted."""
     rng = np.random.default_rng(3)
@@ -127,6 +129,7 @@ def test_half_a_period_more_of_dead_time_is_no_other_direction():
     assert later.model.opposed == 0.0
 
 
+@pytest.mark.nightly
 def test_a_structure_that_cannot_grow_gets_no_gains_for_a_pendulum_that_is_held_upright():
     """A stable model of the wrong sign had been trusted: it left 6 % of the measurement."""
     rng, interval, rows = np.random.default_rng(1), 0.006, []
@@ -147,6 +150,7 @@ def test_a_structure_that_cannot_grow_gets_no_gains_for_a_pendulum_that_is_held_
     assert results["direction"] is Result.FAILED
 
 
+@pytest.mark.nightly
 def test_a_step_from_a_known_command_begins_from_rest():
     """The movement before it had stood for all of the answer, and a later sag for the response."""
     rng, n = np.random.default_rng(61), 290

@@ -40,7 +40,7 @@ def servo_record(friction, noise=0.0):
     return tune.record()
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_an_integrator_in_dry_friction_is_not_taken_for_one_that_regulates_itself():
     # The first amplitude that the sensor shows clearly is 0.48 V, three times the friction.
     found = identify(servo_record(0.15))

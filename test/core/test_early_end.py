@@ -137,7 +137,7 @@ def test_a_test_of_three_lags_ends_early_and_its_interval_is_true():
     assert analyse(record, alone=True).best_gains is not None
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_the_predicted_ms_holds_on_the_process():
     model = TransferFunction.fopdt(1.0, 1.0, 0.5)
     tune, found = _ended(model, MS, 0.04)

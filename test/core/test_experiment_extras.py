@@ -148,7 +148,7 @@ def test_a_given_amplitude_beyond_the_ends_of_the_actuator_never_completes(
     assert command == baseline
 
 
-@pytest.mark.by_day(2)
+@pytest.mark.long
 @pytest.mark.parametrize("share", [0.1, 0.6, 0.2, 0.4])
 @pytest.mark.parametrize("std", [0.002, 0.02])
 @pytest.mark.parametrize("known", [Known(structure="fopdt"), Known()], ids=["fopdt", "chosen"])
@@ -170,8 +170,8 @@ def test_of_both_levels_clipped_alike_only_gains_that_hold_are_trusted(known, sh
         assert hold or found.verdict is not Verdict.TRUSTED
 
 
+@pytest.mark.nightly
 @pytest.mark.long
-@pytest.mark.by_day(1)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_levels_that_the_actuator_does_not_reach_show_beside_the_smaller_ones(seed):
     """The gains have to hold before and after the last growth: their Ms had been up to 1.49."""

@@ -42,6 +42,7 @@ def _record(
     return run.record(noise_std=std, rng=np.random.default_rng(seed))
 
 
+@pytest.mark.nightly
 def test_without_noise_records_of_different_operating_points_give_the_process_exactly():
     records = (_record(at=5.0), _record(at=-80.0, bias=0.3, samples=700))
     found = identify_jointly(records, "waveform")

@@ -244,6 +244,7 @@ def test_each_half_of_a_record_tells_its_own_process():
         assert np.median(away) < 0.15
 
 
+@pytest.mark.nightly
 def test_a_process_that_changed_is_drawn_as_each_half_shows_it():
     found = in_parts(joined(PROCESS, TransferFunction.fopdt(2.0, 10.0, 5.0)))
     late = [m.dead_time for m in found.draws]
@@ -254,13 +255,14 @@ def test_a_process_that_changed_is_drawn_as_each_half_shows_it():
     assert not any("two parts of the record" in text for text in same.warnings)
 
 
-@pytest.mark.by_day(1)
+@pytest.mark.long
 @pytest.mark.parametrize("dead_time", [3.063, 3.064, 3.065])
 def test_parts_that_differ_as_much_as_their_noise_are_not_told(dead_time):
     found = in_parts(joined(PROCESS, TransferFunction.fopdt(2.0, 10.0, dead_time)))
     assert not any("differ 1 times" in text for text in found.warnings)
 
 
+@pytest.mark.nightly
 def test_gains_hold_on_both_parts_of_a_process_that_changed():
     other = TransferFunction.fopdt(2.0, 10.0, 5.0)
     gains = analyse(joined(PROCESS, other), known=Known(structure="fopdt"), alone=True).best_gains
@@ -301,6 +303,7 @@ def test_no_draw_goes_beyond_what_the_samples_allow():
         assert np.abs(model(w) / process(w) - 1.0).max() < 0.5
 
 
+@pytest.mark.nightly
 def test_a_zero_never_makes_a_fit_worse():
     """Where the zero is 0, dead time and zero cancel to first order, and a search may stay."""
     record = steps(TransferFunction.sopdt(0.8, (2.0, 0.4), 0.0), noise=0.05)

@@ -120,7 +120,7 @@ def test_bounds_hold_on_the_models_around_it_too():
     assert tune(model, options=task.options).i > 1.1 * gains.i
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_noise_in_the_command_is_limited_as_far_as_the_law_has_a_filter():
     model, period = PROCESSES["fopdt"], 0.05
     noisy = {"noise_std": 0.02, "amplitude": 1.0, "controller": "pid"}

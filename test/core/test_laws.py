@@ -292,8 +292,8 @@ def test_responses_and_figures_are_those_of_a_simulation(model, ti, period):
     assert found.overshoot == pytest.approx(max(setpoint.measurement.max() - 1.0, 0.0), abs=1e-4)
 
 
+@pytest.mark.nightly
 @pytest.mark.long
-@pytest.mark.by_day(1)
 @pytest.mark.parametrize("name", ["pid_controller", "ardupilot_rate"])
 def test_a_law_far_faster_than_its_loop_has_the_effort_of_its_simulation(name):
     """So many samples are not computed one by one, and the derivative kicks in a few of them."""

@@ -106,7 +106,7 @@ def _records(
 
 
 @pytest.mark.long
-@pytest.mark.by_day(2)
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.nightly), 0.01])
 @pytest.mark.parametrize("epsilon", [pytest.param(0.0, marks=pytest.mark.nightly), 0.2])
 @pytest.mark.parametrize(
@@ -132,6 +132,7 @@ def test_records(process, epsilon, noise):
     assert any("equations of the describing function" in w for w in found.warnings)
 
 
+@pytest.mark.long
 def test_a_known_dead_time_is_kept():
     process = TransferFunction.lag_n(2.0, 3.0, 2, 1.0)
     known = Known(dead_time=1.0, structure="lag_n", order=2)
@@ -166,6 +167,7 @@ def test_records_that_do_not_belong_together_are_refused():
         identify_jointly((first, biased), "li")
 
 
+@pytest.mark.long
 def test_a_structure_that_disagrees_is_said_to():
     tests = _tests(TransferFunction.lag_n(2.0, 3.0, 3, 0.5))
     found = li_from_numbers(tests, Known(dead_time=0.5, structure="sopdt"))

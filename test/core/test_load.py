@@ -77,6 +77,7 @@ def test_no_load_is_found_where_noise_explains_what_is_left(noise_std):
     assert not any("load step" in text for text in found.warnings)
 
 
+@pytest.mark.nightly
 def test_what_is_not_known_of_the_load_widens_the_intervals():
     tune = run(SECOND_ORDER, load_time=25.6, load_size=0.2, noise_std=0.0114, seed=1003)
     known, record = Known(structure="sopdt"), tune.record()
@@ -89,7 +90,7 @@ def test_what_is_not_known_of_the_load_widens_the_intervals():
     assert np.all(np.diag(loaded.covariance) > np.diag(as_if_known.covariance))
 
 
-@pytest.mark.by_day(1)
+@pytest.mark.nightly
 @pytest.mark.parametrize(("noise_std", "seed"), [(0.0114, 1003), (0.0001, 3)])
 def test_all_draws_are_had_beside_a_load_and_a_zero_that_a_dead_time_cancels(noise_std, seed):
     acting = {"load_time": 25.6, "load_size": 0.2, "noise_std": noise_std, "seed": seed}
@@ -135,7 +136,7 @@ def controlled(
     return Record(interval * np.arange(samples), y, u)
 
 
-@pytest.mark.by_day(1)
+@pytest.mark.nightly
 @pytest.mark.parametrize("load", [0.0, -5.0])
 def test_a_load_under_a_controller_does_not_change_the_model(load):
     """It was taken for a slow disturbance, and the gain for two thirds of what it is."""
@@ -155,6 +156,7 @@ def test_a_load_at_0_s_counts_as_one():
     assert nuisances_of(replace(problem, load=0.0), ("load",)) == (True,)
 
 
+@pytest.mark.nightly
 def test_a_load_is_found_beside_white_noise_that_looks_coloured_by_chance():
     """Of white residuals, too, some are given a colour: that is no slow disturbance."""
     record = controlled(
@@ -166,6 +168,7 @@ def test_a_load_is_found_beside_white_noise_that_looks_coloured_by_chance():
     assert found.model.gain == pytest.approx(3.0, rel=0.05)
 
 
+@pytest.mark.nightly
 def test_gains_hold_where_a_load_after_the_only_move_was_a_part_of_the_response():
     """Two paths to one measurement; Ms was 26, and the gains were trusted."""
     early, delay = 0.5, 10.0

@@ -42,7 +42,7 @@ def _true_ms(gains) -> float:
 
 
 # Up to three quarters of an interval before the row that shows the change.
-@pytest.mark.by_day(1)
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("interval", "instants"),
     [(30.0, (609.0, 2240.0, 3906.0)), (60.0, (615.0, 2240.0, 3920.0))],
@@ -92,6 +92,7 @@ def test_gains_hold_whichever_came_first_in_a_row(late):
     assert "up to 1.00 s" in warning
 
 
+@pytest.mark.nightly
 def test_rows_about_each_change_tell_when_it_came():
     found = analyse(_in_loop(late=0, doubled=True), alone=True)
     assert not any("before its row" in warning for warning in found.model.warnings)
@@ -106,6 +107,7 @@ def test_rows_that_are_close_against_the_dead_time_are_told_nothing_of_it():
     assert _true_ms(found.best_gains) < 1.5
 
 
+@pytest.mark.nightly
 def test_an_archive_of_changes_tells_when_the_command_moved():
     """Rows come where the measurement has moved by a band, or the command."""
     every = _logged(2.0, (600.0, 2240.0, 3906.0))

@@ -23,7 +23,7 @@ PERIOD = 0.09
 
 
 # With these seeds noise made few cycles, and the tune went on for more than 15,000 samples.
-@pytest.mark.by_day(1)
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [5, 7, 15, 26, 49])
 def test_an_actuator_that_sticks_while_the_amplitude_is_found_ends_the_tune(seed):
     plant = VirtualProcess(PROCESS, disturbances=Disturbances(noise_std=0.004), seed=seed)

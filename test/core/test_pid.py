@@ -177,6 +177,7 @@ def test_the_process_itself_passes(step, noise_std):
     assert found.fit > 0.8
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step", [Step(setpoint=-0.5), Step(load=0.4)])
 def test_the_settling_time_is_predicted_within_the_band_in_which_it_is_measured(step):
     """8 s within 11 % stood beside 25 s predicted within 5 %, of a loop as predicted."""
@@ -263,6 +264,7 @@ def test_the_step_that_proves_is_clear_of_the_noise_and_within_limits(
     assert abs(tight) == pytest.approx(0.08)
 
 
+@pytest.mark.long
 def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
     record = Record(
         time=0.01 * np.arange(401.0), measurement=np.full(401, 40.0), command=np.full(401, 2.0),
@@ -301,6 +303,7 @@ def test_only_steps_are_allowed_whose_predicted_peak_stays_within_the_limits():
         noisy.require(-0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rate", [None, LawRate(LAWS["simple_pid"], 0.1)])
 def test_the_command_that_is_expected_holds_what_the_noise_does(rate):
     """By a simulation in noise: a derivative makes more of it than of the step."""
@@ -326,8 +329,8 @@ def test_the_command_that_is_expected_holds_what_the_noise_does(rate):
     assert (least - low, high - most) == pytest.approx((spread, spread), rel=0.1)
 
 
+@pytest.mark.nightly
 @pytest.mark.long
-@pytest.mark.by_day(1)
 # The largest deviation by a load takes up noise, which makes its comparison looser.
 @pytest.mark.parametrize(("step", "less"), [(Step(setpoint=1.0), 0.2), (Step(load=1.0), 0.06)])
 def test_the_least_step_is_where_the_noise_begins_to_decide(step, less):

@@ -91,7 +91,7 @@ def test_play_is_no_term_where_the_command_cannot_show_it(levels, shown):
     assert all((problem.most_play(held=held) > 0.0) is shown for held in (False, True))
 
 
-@pytest.mark.by_day(1)
+@pytest.mark.nightly
 @pytest.mark.parametrize(("band", "noise"), [(0.04, 0.01), (0.0, 0.005), (0.04, 0.005)])
 def test_a_relay_whose_first_cycle_is_smaller_shows_its_play(band, noise):
     """K_u was 2 % off for a play of 2 % of the swing, and nothing was said of it."""
@@ -107,6 +107,7 @@ def test_a_relay_whose_first_cycle_is_smaller_shows_its_play(band, noise):
     assert found.ultimate_gain == pytest.approx(ultimate_point(PROCESS).gain, rel=0.01)
 
 
+@pytest.mark.nightly
 def test_a_joint_that_rings_is_not_taken_for_lags_with_a_play():
     """Of its own structure no play is left, which is no reason to leave that structure out."""
     ringing = complex(0.2 / 30.0, math.sqrt(1.0 - 0.2**2) / 30.0)
@@ -122,6 +123,7 @@ def test_a_joint_that_rings_is_not_taken_for_lags_with_a_play():
     assert found.ultimate_gain == pytest.approx(ultimate_point(joint).gain, rel=0.03)
 
 
+@pytest.mark.nightly
 def test_the_interval_of_the_ultimate_gain_holds_both_sides():
     found = analyse(record_of(UP_AND_DOWN, falling_gain=0.7), alone=True).model
     above, below = found.effects

@@ -24,6 +24,7 @@ MODELS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", MODELS, ids=lambda m: m.structure)
 def test_the_exported_model_has_the_same_frequency_response(model) -> None:
     pytest.importorskip("control")

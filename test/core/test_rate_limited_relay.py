@@ -49,8 +49,8 @@ def test_methods_for_an_ideal_relay_step_aside(method):
     assert identify(_record(0.0), method).model.gain > 0.0
 
 
+@pytest.mark.nightly
 @pytest.mark.long
-@pytest.mark.by_day(1)
 @pytest.mark.parametrize(
     "model",
     [TransferFunction.fopdt(1.65, 20.0, 10.0), INTEGRATOR_LAG.build((0.5, 2.0, 1.0))],

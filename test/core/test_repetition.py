@@ -49,6 +49,7 @@ def run(*, repeat_period, dies=math.inf, noise_std=0.0, quantisation=0.02, **giv
     return tune, [k for k in came if k < tune.sample_count]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("quantisation", "noise_std", "repeat_period", "within"),
     [(0.02, 0.0, 0.3, 0.01), (0.05, 0.0, 1.0, 0.03), (0.05, 0.01, 0.3, 0.01)],

@@ -64,6 +64,7 @@ def test_without_the_word_that_it_is_the_present_command_a_baseline_may_lead_els
     assert tune.facts.rest.mean == pytest.approx(8.0, abs=0.2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "acting",
     [

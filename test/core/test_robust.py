@@ -105,7 +105,7 @@ def test_the_least_ms_on_an_unstable_process(ratio, pi, pid):
     assert search.least_ms(derivative=True) == pytest.approx(pid, rel=0.015)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_an_infeasible_bound_is_relaxed_with_a_warning():
     model = UNSTABLE_FOPDT.build((2.0, 3.0, 0.9))
     options = DesignOptions(controller="pi")
@@ -197,7 +197,7 @@ def test_bounds_that_can_just_be_kept_on_the_models_around_are_kept():
     assert all(is_stable(controller, m) for m in models[::10])
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_a_gain_beside_the_ultimate_one_does_not_pass_for_one_without_limit():
     # With the filter, one of the gains that are scanned lies within a cell of the ultimate one.
     model = UNSTABLE_SOPDT.build((0.976, 0.5765, 0.04902, 0.04714))
@@ -206,6 +206,7 @@ def test_a_gain_beside_the_ultimate_one_does_not_pass_for_one_without_limit():
     assert is_stable(controller, model)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "limit"),
     [
@@ -263,6 +264,7 @@ def test_gains_that_no_filter_makes_quiet_enough_are_no_candidates():
     assert np.all(np.isinf(found.tf)) and np.all(found.ki == -math.inf)
 
 
+@pytest.mark.long
 def test_models_of_a_far_longer_dead_time_slow_the_loop_down():
     # Of the process alone next to nothing limits the gain; on the others a tenth of it would do.
     process = TransferFunction(40.0, (4900.0,), (20000.0, 3300.0), 0, 2.5)
@@ -277,6 +279,7 @@ def test_a_grid_of_one_frequency_shows_no_crossing():
     np.testing.assert_array_equal(found, np.full((1, 4), math.inf))
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("error")
 def test_a_process_of_which_no_sample_shows_anything_gets_no_gains():
     """All that it does after a step is over within a fiftieth of a sampling period.

@@ -176,6 +176,7 @@ def test_tables_6_and_7():
 
 
 # Two of the processes take hundreds of cycles to their limit.
+@pytest.mark.long
 @pytest.mark.parametrize("name", [n for n in PROCESSES if not n.startswith(("ex4", "eq42"))])
 def test_the_limit_cycle_of_a_model_is_that_of_a_relay(name):
     model = PROCESSES[name]

@@ -23,7 +23,7 @@ PERIOD = 0.02
 
 
 @pytest.mark.long
-@pytest.mark.by_day(1)
+@pytest.mark.long
 @pytest.mark.parametrize("dead_time", [0.4, 0.9])
 def test_the_process_is_told_from_its_controller_read_backward(dead_time):
     model = TransferFunction.fopdt(2.0, 1.0, dead_time)
@@ -57,6 +57,7 @@ def test_the_process_is_told_from_its_controller_read_backward(dead_time):
     assert assess([found], record)[0].validation is None
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("ramp", [2.0, 22.0], ids=["near a step", "two periods long"])
 def test_a_loop_whose_set_point_is_ramped_is_not_taken_for_its_controller(ramp):
     """What is given from outside is small at each row beside the noise that the controller passes.

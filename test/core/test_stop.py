@@ -40,6 +40,7 @@ def test_a_stop_is_no_rest(noise):
     assert found.best_gains is None or Loop(found.best_gains, AXIS).ms() < 1.75
 
 
+@pytest.mark.long
 def test_what_lies_at_the_end_of_a_sensor_is_left_out():
     found = identify(recorded(LAG, [3.0], [1.0], end=6.0), known=Known(structure="fopdt"))
     assert told_of_a_stop(found)
@@ -48,6 +49,7 @@ def test_what_lies_at_the_end_of_a_sensor_is_left_out():
     assert found.ultimate_gain == pytest.approx(ultimate_point(LAG).gain, rel=0.3)
 
 
+@pytest.mark.long
 def test_what_comes_after_the_end_of_a_sensor_counts_where_the_command_moves_more_often():
     time, rng = np.arange(0.0, 60.0, 0.05), np.random.default_rng(3)
     later = np.arange(9.0, 60.0, 3.0)
@@ -61,6 +63,7 @@ def test_what_comes_after_the_end_of_a_sensor_counts_where_the_command_moves_mor
     assert found.ultimate_gain == pytest.approx(ultimate_point(LAG).gain, rel=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "changes", "levels"),
     [
@@ -74,7 +77,7 @@ def test_a_process_that_comes_to_rest_stands_at_no_stop(model, changes, levels):
     assert not told_of_a_stop(identify(recorded(model, changes, levels), known=known))
 
 
-@pytest.mark.by_day(1)
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("tau", "dead_time"), [(1.63, 4.76), (0.44, 1.34), (1.12, 4.94), (1.32, 3.64)]
 )
@@ -89,6 +92,7 @@ def test_a_process_as_fast_as_its_samples_stands_at_no_stop(tau, dead_time):
     assert found.model.gain == pytest.approx(1.0, rel=0.01)
 
 
+@pytest.mark.long
 def test_a_motor_that_is_back_at_a_speed_which_it_had_stands_at_no_stop():
     """It turns around sooner than it brakes, of which the model of what came before is."""
     time, rng = 0.02 * np.arange(1000), np.random.default_rng(1)

@@ -197,8 +197,8 @@ def test_without_noise_the_true_structure_is_found_exactly(name):
     assert found.ultimate_gain == pytest.approx(ultimate_point(model).gain, rel=1e-8)
 
 
+@pytest.mark.nightly
 @pytest.mark.long
-@pytest.mark.by_day(1)
 @pytest.mark.parametrize(("name", "seed"), IN_NOISE)
 def test_in_noise_the_choice_gives_the_ultimate_point(name, seed):
     model = PROCESSES[name]
@@ -223,6 +223,7 @@ def test_the_true_structure_given_its_errors_are_those_stated(name):
         assert np.abs(pulls).max() < 5.0
 
 
+@pytest.mark.long
 def test_a_structure_that_is_not_in_the_data_can_be_forced():
     found = identify_waveform(_record(PROCESSES["lag_n"], 0.02), Known(structure="fopdt"))
     assert found.structure == "fopdt"
@@ -230,7 +231,7 @@ def test_a_structure_that_is_not_in_the_data_can_be_forced():
 
 
 @pytest.mark.long
-@pytest.mark.by_day(1)
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_no_rival_rings_faster_than_the_samples_show(seed):
     """In noise, a resonance between two samples fits as well as none, and has any height."""

@@ -53,6 +53,7 @@ def test_any_numbers_give_a_model_or_a_sentence(amplitude, dead_time, share, gai
             assert all(t.real > 0.0 for t in found.model.time_constants)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("samples", [3, 10, 60])
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_a_poor_record_gives_a_model_or_a_sentence(samples, noise):

@@ -61,8 +61,8 @@ def test_what_is_analysed_is_bounded_however_long_and_whatever_the_command(shape
     assert short.duration > 0.99 * 1000.0
 
 
+@pytest.mark.nightly
 @pytest.mark.long
-@pytest.mark.by_day(2)
 @pytest.mark.parametrize("shape", ["steps", "sine", "noise", "step"])
 def test_the_model_is_that_of_all_samples_within_its_interval(shape):
     rng = np.random.default_rng(2)
@@ -102,6 +102,7 @@ def test_the_mean_of_a_command_that_changes_all_the_time_is_kept():
     assert area == pytest.approx(exact, abs=1e-9)
 
 
+@pytest.mark.long
 def test_of_a_fast_response_a_part_about_the_first_changes_is_used_and_said():
     rng = np.random.default_rng(5)
     fast = TransferFunction.fopdt(2.0, 0.05, 0.02)
@@ -151,7 +152,7 @@ def test_cycles_begin_where_they_began():
     np.testing.assert_allclose(begun, t[list(starts)], atol=0.02)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_an_analysis_says_so_and_designs_for_single_samples():
     rng = np.random.default_rng(9)
     t = np.linspace(0.0, 1000.0, 30_000)

@@ -163,6 +163,7 @@ def test_two_equal_lags_with_hysteresis(relay, ratio):
     assert found == pytest.approx((1.5, 3.0, 3.0 * ratio), rel=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("relay", RELAYS[1:])
 @pytest.mark.parametrize("order", [3, 5, 10, pytest.param(20, marks=pytest.mark.nightly)])
 def test_higher_orders_with_hysteresis(relay, order):

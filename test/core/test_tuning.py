@@ -34,6 +34,7 @@ def _controller(name: str, inputs: dict[str, float]) -> Controller:
 DESIGNS = cases("design.")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "inputs", "exact", "tol"), DESIGNS, ids=[d[0] for d in DESIGNS])
 def test_worked_loops(name, inputs, exact, tol):
     controller, model = _controller(name, inputs), PROCESSES[inputs["process"]]
@@ -76,6 +77,7 @@ def _identified(noise: float):
     return identify_waveform(record, Known(structure="fopdt"))
 
 
+@pytest.mark.long
 def test_the_ensemble_of_a_covariance_has_its_spread():
     # A method that gives a covariance alone, as the published ones do.
     found = replace(_identified(0.1), draws=())

@@ -143,6 +143,7 @@ def test_a_determined_model_needs_no_combinations():
     assert found.advice == ()
 
 
+@pytest.mark.nightly
 def test_rivals_have_support():
     model = TransferFunction.lag_n(1.0, 6.0, 8, 0.6)
     relay = RelaySettings(0.0, 0.0, 1.0)

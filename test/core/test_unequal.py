@@ -24,7 +24,7 @@ from relay_autotune.record.record import PiecewiseConstant, Record
 pytestmark = pytest.mark.long
 
 
-@pytest.mark.by_day(1)
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("gains", "moves"),
     [
@@ -68,7 +68,7 @@ def test_a_staircase_over_a_gain_that_grows_is_no_integrator():
     assert sum(t.real for t in found.model.time_constants) < 40.0
 
 
-@pytest.mark.by_day(2)
+@pytest.mark.nightly
 @pytest.mark.parametrize("ends", [(-3.0, 8.0), (-100.0, 100.0), (-5.0, 12.0), (-100.0, 8.0)])
 def test_an_actuator_that_ends_is_found_in_what_its_controller_sent(ends):
     """Without the ends the model was trusted with half of the gain, and a true Ms of 3.5."""
@@ -110,6 +110,7 @@ def test_ends_are_found_where_the_controller_is_beyond_them_most_of_the_time():
     assert found.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.05)
 
 
+@pytest.mark.nightly
 def test_a_dead_zone_is_the_lower_end_of_what_is_answered():
     """It was trusted with four fifths of the gain."""
     time = np.arange(400) * 1.0

@@ -33,6 +33,7 @@ def record_of(model, relay, cycles=6, samples=1200, noise_std=0.0):
     return run.record(noise_std=noise_std, rng=np.random.default_rng(4))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("model", "relay"),
     [

@@ -149,6 +149,7 @@ def test_unbiased_relay_with_a_known_gain(name, inputs, exact, tol):
     assert found == pytest.approx((exact["K"], exact["T"], exact["L"]), rel=tol)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("method", "bias"), [(identify_biased, 0.3), (identify_unbiased, 0.0)])
 @pytest.mark.parametrize("gain", [1.65, -1.65])
 def test_a_known_gain_is_used(method, bias, gain):
@@ -217,7 +218,7 @@ def test_the_error_of_the_steady_state_is_one_of_the_gain():
     assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.5
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_noise_that_makes_a_lag_look_like_an_integrator_leaves_the_ultimate_point():
     # The amplitude is 0.1 % below that of an integrator, and the noise of the peaks is larger.
     model, relay = TransferFunction.fopdt(1.0, 1.0, 0.1), RelaySettings(0.0, 0.0, 1.0, 0.0, 0.0)

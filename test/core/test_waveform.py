@@ -216,6 +216,7 @@ def test_a_gain_that_the_data_do_not_tell_is_named():
     assert abs(found.ultimate_gain_std / found.ultimate_gain) < 0.05
 
 
+@pytest.mark.nightly
 def test_whether_a_slow_process_integrates_is_said_to_be_open():
     found = identify_waveform(_noisy(_run(1.0, 1.0, 0.02), 0.2, 3))
     assert found.structure == "ipdt"
@@ -256,7 +257,7 @@ def test_exchanged_columns_of_a_test_by_steps_are_named(exchanged):
     assert ("the wrong way round" in told) == exchanged
 
 
-@pytest.mark.by_day(1)
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [8, 0, 2, 11])
 def test_noise_shows_no_response_whichever_fits_to_it_run_off(seed):
     """With 0 that turns on the last digit, in 2 and 8 all do, and 11 has none to begin with."""
@@ -300,7 +301,7 @@ def test_ljung_box_is_uniform_for_white_noise_and_small_for_coloured():
     assert math.isnan(ljung_box(np.array([1.0, 2.0])))
 
 
-@pytest.mark.by_day(1)
+@pytest.mark.long
 @pytest.mark.parametrize(("length", "number"), [(3, 20), (1, 9), (2, 20)])
 def test_spikes_of_the_sensor_are_left_out_and_told(length, number):
     process = (1.65, 20.0, 10.0)
@@ -330,7 +331,7 @@ def test_samples_of_a_step_that_the_model_misses_are_no_spikes():
     assert not any("spikes" in w for w in found.warnings)
 
 
-@pytest.mark.by_day(2)
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(8))
 def test_clean_records_have_no_outliers(seed):
     found = identify_waveform(_noisy(_run(1.65, 20.0, 10.0), 0.1, seed), FOPDT)
@@ -378,6 +379,7 @@ def test_neither_noise_nor_drift_counts_as_a_first_response(dead_time, tau, drif
     assert latest_dead_time(time, y, step, 1) >= 2.0 * dead_time
 
 
+@pytest.mark.nightly
 def test_a_dead_time_that_hides_the_first_response_is_no_explanation():
     """Steps of one length, unequal in their effect, look like each other one step later."""
     time = np.arange(0.0, 4900.0, 4.0)
@@ -449,6 +451,7 @@ def test_a_jump_in_the_last_samples_is_left_out():
     assert any("15 of the samples, the first at 292.5 s" in w for w in found.warnings)
 
 
+@pytest.mark.nightly
 def test_a_sensor_that_drops_out_is_left_out():
     rng = np.random.default_rng(3)
     time = np.arange(0.0, 435.0, 0.5)
@@ -467,6 +470,7 @@ def test_a_sensor_that_drops_out_is_left_out():
         assert any(f"{away.size} of the samples, the first at" in w for w in found.warnings)
 
 
+@pytest.mark.nightly
 def test_a_first_row_of_nothing_is_left_out():
     """A past and a free state that cancel each other by millions of ranges had explained it."""
     rng, n = np.random.default_rng(1), 420
@@ -484,6 +488,7 @@ def test_a_first_row_of_nothing_is_left_out():
     assert found.model.gain == pytest.approx(0.8, rel=0.05)
 
 
+@pytest.mark.nightly
 def test_a_first_row_from_before_the_sensor_was_ready_is_left_out():
     """A random walk had explained the row and the response."""
     rng = np.random.default_rng(5)
@@ -498,6 +503,7 @@ def test_a_first_row_from_before_the_sensor_was_ready_is_left_out():
     assert found.model.gain == pytest.approx(5.0, rel=0.3)
 
 
+@pytest.mark.nightly
 def test_a_process_that_falls_is_found_in_a_record_far_longer_than_its_fall():
     """A record of 20 s had been searched for growth in 8 s and more."""
     rng, period, late = np.random.default_rng(1), 0.002, 2

@@ -64,6 +64,7 @@ CODE = code_text()
 WORDS = frozenset((*re.findall(r"\w+", CODE), *LAWS))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("page", GUIDE, ids=lambda p: str(p.relative_to(ROOT)))
 def test_what_the_code_says_is_written_in_the_page(page: Path) -> None:
     assert page.read_text() == filled(page.read_text()), "run `python3 -m tools.fill_docs`"
@@ -227,6 +228,7 @@ def test_every_interface_is_in_the_guide() -> None:
     assert shown == files
 
 
+@pytest.mark.long
 def test_the_guide_has_the_fields_of_the_document() -> None:
     bag = ROOT / "bags/biased_relay"
     found = document(str(bag), [analysed_once(read_experiments(bag).experiments[0])])

@@ -56,7 +56,7 @@ def write_log(u: PiecewiseConstant) -> None:
     Path("log.csv").write_text("Time (s),SP,PV (°C),OP (%)\n" + "\n".join(rows))
 
 
-@pytest.mark.by_day(1)
+@pytest.mark.long
 @pytest.mark.parametrize("by_hand", [by_steps, by_relay])
 def test_a_test_by_hand_gives_gains_that_hold(by_hand, tmp_path, monkeypatch, capsys):
     only(monkeypatch, "experiment")

@@ -42,6 +42,7 @@ def once() -> dict[str, Callable[..., Any]]:
     return {name: remembering(name) for name in ("read_records", "analyse", "identify")}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["__init__", *relay_autotune.__all__])
 def test_help_has_an_example_that_is_true(
     name: str, once: dict[str, Callable[..., Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

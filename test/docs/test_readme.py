@@ -34,6 +34,7 @@ def run(words: list[str], capfd: pytest.CaptureFixture[str]) -> tuple[str, int]:
     return PROGRESS.sub("", said.err) + said.out, status
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("block", blocks("console"), ids=str)
 def test_a_console_shows_what_the_command_prints(
     block: Block, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -47,6 +48,7 @@ def test_a_console_shows_what_the_command_prints(
         assert matches(shown, output), output
 
 
+@pytest.mark.long
 def test_logs_of_other_tools_are_read_by_the_commands_shown(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -60,6 +62,7 @@ def test_logs_of_other_tools_are_read_by_the_commands_shown(
     assert models[0] == models[1] == models[3] != []
 
 
+@pytest.mark.long
 def test_the_lines_of_python_go_from_a_log_to_gains_and_a_figure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -80,6 +83,7 @@ def test_the_lines_of_python_go_from_a_log_to_gains_and_a_figure(
     assert "Heater" in Path("report.html").read_text()
 
 
+@pytest.mark.long
 def test_the_demo_shown_is_the_one_computed(capsys: pytest.CaptureFixture[str]) -> None:
     demo._compare(case_of(tune_as_the_demo(), "demo", truth=demo.TRUTH))
     assert capsys.readouterr().out == block_noted("docs/quick_start.md", "made by the demo").text
@@ -120,6 +124,7 @@ def test_make_has_every_target_named() -> None:
         assert set(named) <= targets, page
 
 
+@pytest.mark.long
 def test_colcon_finds_both_packages_in_both_layouts(tmp_path: Path) -> None:
     if not shutil.which("colcon"):
         pytest.skip("colcon is not installed")

@@ -37,6 +37,7 @@ sys.exit(lifetime.run(create, "stuck", []))
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("fails", "status"), [(False, 0), (True, 1)])
 def test_a_node_that_cannot_leave_the_graph_ends_all_the_same(fails: bool, status: int) -> None:
     done = subprocess.run(

@@ -89,6 +89,7 @@ def test_a_feedback_with_impossible_numbers_is_shown(name: str, value: float) ->
     assert all(is_harmless(line) and "\n" not in line for line in lines)
 
 
+@pytest.mark.long
 def test_the_log_of_a_node_has_one_line_for_each_text() -> None:
     done = subprocess.run(
         [sys.executable, "-c", TOLD, FORGED],

@@ -102,6 +102,7 @@ def test_each_node_and_each_loop_has_its_own(tmp_path):
     assert len(paths) == 36
 
 
+@pytest.mark.nightly
 def test_a_second_process_is_refused_and_a_killed_one_leaves_a_whole_file(tmp_path):
     rng = Random(1)
     for _ in range(5):
@@ -234,6 +235,7 @@ def random_document(rng: Random) -> dict[str, Any]:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [OwnGains, Elsewhere])
 def test_no_journal_puts_gains_in_force_that_are_neither_proven_nor_asked_for(
     tmp_path, monkeypatch, kind

@@ -75,6 +75,7 @@ def test_nothing_is_known_unless_it_is_given() -> None:
         known_from({**NOTHING, "known_gain": 0.0})
 
 
+@pytest.mark.nightly
 def test_li_takes_the_last_two_experiments_and_facts_reach_the_methods(
     node: IdentifierNode,
 ) -> None:
@@ -107,6 +108,7 @@ def test_li_takes_the_last_two_experiments_and_facts_reach_the_methods(
     assert {entry.name for entry in KNOWN} <= {entry.name for entry in PARAMETERS}
 
 
+@pytest.mark.long
 def test_gains_are_for_the_law_of_the_parameter(
     node: IdentifierNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -128,6 +130,7 @@ def test_gains_are_for_the_law_of_the_parameter(
     assert Loop(law, PROCESS).ms() == pytest.approx(gains.ms, rel=1e-3)
 
 
+@pytest.mark.nightly
 def test_progress_is_answered_with_what_is_sought(
     node: IdentifierNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:

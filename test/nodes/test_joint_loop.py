@@ -154,6 +154,7 @@ def test_gains_are_designed_for_the_law_of_the_strategy(strategy: str, velocity:
     assert ours == pytest.approx(theirs, rel=1e-9)
 
 
+@pytest.mark.long
 def test_a_step_of_a_joint_with_a_velocity_state_is_predicted_as_it_is_made() -> None:
     """The velocity of the joint itself, which its difference lags by half a period."""
     period, lag, gains = 0.01, 0.3, Controller(6.448, 1.169, 0.1623)

@@ -31,6 +31,7 @@ sys.exit(bool(new))
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("node", ["relay", "controller"])
 def test_a_first_model_and_first_gains_load_nothing(node: str) -> None:
     done = subprocess.run(

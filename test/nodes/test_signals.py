@@ -115,6 +115,7 @@ def test_a_file_and_what_is_not_open_are_left_alone(tmp_path) -> None:
     never_wait_for(number)()
 
 
+@pytest.mark.long
 def test_what_is_opened_later_takes_no_place_of_a_closed_output() -> None:
     """Else what is logged would go into a socket, or into the recording."""
     code = (

@@ -79,6 +79,7 @@ def test_every_package_has_its_floor():
     assert found - {"__init__", "start"} == set(FLOOR_OF)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("package", FLOOR_OF)
 def test_a_package_imports_downwards_only(package):
     upwards = [

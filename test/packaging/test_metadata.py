@@ -70,6 +70,7 @@ def test_manifest_is_valid(manifest: Path):
     assert package.licenses == ["Apache-2.0"]
 
 
+@pytest.mark.long
 def test_manifest_names_what_is_imported():
     """Every distribution that the package imports is a dependency that rosdep can install."""
     keys = {

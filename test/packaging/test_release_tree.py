@@ -40,6 +40,7 @@ def test_changelogs_are_what_release_tools_read(tree):
         assert changelog.get_changelog_from_path(str(tree / name), name) is not None
 
 
+@pytest.mark.long
 def test_colcon_lists_both_without_flags(tree):
     listed = subprocess.run(
         [sys.executable, "-m", "colcon", "list"],

@@ -44,6 +44,7 @@ def run_a_test(site_packages: Path, *options: str) -> subprocess.CompletedProces
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_the_plugins_of_a_sourced_ros_do_not_end_the_tests(site_packages: Path):
     # without our settings they do, or this would prove nothing
     bare = run_a_test(site_packages, "-c", os.devnull, "--rootdir", str(ROOT))

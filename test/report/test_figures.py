@@ -142,11 +142,13 @@ def test_rules_that_give_the_same_gains_are_drawn_once() -> None:
     assert distinct_gains(replace(case, gains=(best, twin))) == (best,)
 
 
+@pytest.mark.long
 def test_the_picture_holds_what_there_is(tmp_path) -> None:
     draw(fruitless(), tmp_path / "figure.png", title="a test")
     assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("ending", "start"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")]
 )
@@ -163,6 +165,7 @@ def test_a_file_is_what_its_ending_says_and_the_same_every_time(
     assert written[0] == written[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("key", ["nyquist", "closed_loop"])
 def test_the_same_case_gives_the_same_bytes(key: str) -> None:
     case = case_of(completed(), "tank")

@@ -175,6 +175,7 @@ def test_the_summary_has_the_gains_the_model_and_how_sure_they_are(whole: str) -
         assert each.rule in text
 
 
+@pytest.mark.long
 def test_names_and_reasons_from_a_bag_are_text_and_never_html() -> None:
     hostile = replace(aborted(HOSTILE), record=replace(
         aborted(HOSTILE).record, experiment_id=HOSTILE
@@ -210,6 +211,7 @@ def test_what_does_not_shake_the_verdict_does_not_head_the_page(
     assert "a load step of -0.211 u" in read(page([case])).text
 
 
+@pytest.mark.long
 def test_without_gains_the_reason_stands_in_their_place() -> None:
     case = replace(case_of(aborted(), "tank"), record=None, models_around=())
     found = read(page([case]))
@@ -229,6 +231,7 @@ def test_where_nothing_was_identified_the_experiment_is_drawn_all_the_same(whole
     assert "Model over the data: nothing was identified" in found.text
 
 
+@pytest.mark.long
 def test_a_document_gives_the_same_report_without_what_needs_samples(monkeypatch) -> None:
     case = from_json(completed())
     direct = case_of(completed(), "bag")

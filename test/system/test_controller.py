@@ -511,6 +511,7 @@ def test_a_relay_on_the_set_point_ends_when_it_knows_enough(rig: Rig) -> None:
     assert models[-1].dead_time == pytest.approx(0.4, abs=0.06)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("given", [math.nan, 0.7])
 def test_its_end_leaves_no_load_of_a_verification(rig: Rig, given: float) -> None:
     commands = rig.listen("command", Float64, RELIABLE)

@@ -29,6 +29,7 @@ def robot(rig: Rig) -> Robot:
     return Robot(rig)
 
 
+@pytest.mark.nightly
 def test_a_wheel_gets_verified_gains_while_its_controller_stays_active(rig: Rig) -> None:
     # With the new gains it is a set-point weight of about 2, which a prediction without it fails.
     robot = Robot(
@@ -163,6 +164,7 @@ def follows(rig: Rig, line: str) -> dict[str, float]:
     return dict(zip(names, goal - before, strict=True))
 
 
+@pytest.mark.nightly
 def test_a_chain_is_opened_as_a_whole_and_closed_again_when_the_tune_is_cancelled(
     rig: Rig,
 ) -> None:

@@ -19,6 +19,7 @@ from relay_autotune_msgs.action import Verify
 from relay_autotune_msgs.msg import TransferFunction
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lag", [0.1, 0.8])
 def test_gains_do_not_fail_when_relay_node_is_killed(rig: Rig, lag: float) -> None:
     """The short step is over before the silence is too long; the plant goes on answering."""

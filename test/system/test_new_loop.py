@@ -81,6 +81,7 @@ def on_screen(written: str) -> str:
     return "\n".join(lines)
 
 
+@pytest.mark.nightly
 def test_the_session_of_the_tutorial_leads_to_proven_gains_and_leaves_nothing_running(
     rig: Rig,
 ) -> None:
@@ -274,6 +275,7 @@ def test_what_cannot_be_a_topic_is_refused_in_one_line(rig: Rig) -> None:
     )
 
 
+@pytest.mark.nightly
 def test_a_sensor_of_less_than_one_sample_a_second_is_tuned(rig: Rig) -> None:
     heard = rig.listen("/tank/valve", Float64, RELIABLE)
     slow = {"sample_period": 1.2, "time_constants": [4.0], "dead_time": 1.0}

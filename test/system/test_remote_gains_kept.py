@@ -138,6 +138,7 @@ def test_the_end_of_the_process_in_a_verification_brings_the_gains_back(
     assert loop.values() == BEFORE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ended", ["apply_gains", "controller_node"])
 def test_a_proof_by_command_that_is_cut_short_leaves_the_gains_of_before(
     rig: Rig, ended: str

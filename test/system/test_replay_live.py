@@ -92,6 +92,7 @@ def test_the_service_refuses_with_a_reason(rig: Rig) -> None:
     assert "unknown method 'guess'" in answer.reason
 
 
+@pytest.mark.nightly
 def test_a_bag_played_into_the_nodes_gives_what_replay_gives(rig: Rig, recorded: Path) -> None:
     (record,) = read_experiments(recorded).experiments
     replayed = analyse(record)

@@ -34,6 +34,7 @@ PLANT: dict[str, Any] = {
 }
 
 
+@pytest.mark.nightly
 def test_a_tune_with_a_sensor_that_is_silent_at_rest(rig: Rig) -> None:
     experiments = rig.listen("relay_experiment", RelayExperiment)
     models = rig.listen("transfer_function", TransferFunction)

@@ -169,9 +169,8 @@ def test_a_terminal_that_is_closed_cancels(rig: Rig) -> None:
     assert tune.shown.wait() == 1
 
 
-@pytest.mark.parametrize(
-    "number", [signal.SIGINT, pytest.param(signal.SIGHUP, marks=pytest.mark.nightly)]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_a_model_that_takes_for_ever_is_not_waited_for(rig: Rig, number: int) -> None:
     quick = {"mode": "lockstep", "lockstep_speed": 15.0, "seed": 3}
     rig.start("plant_node", *NAMED, **quick, **LOOP)

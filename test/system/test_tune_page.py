@@ -151,6 +151,7 @@ LOOP = {
 }  # fmt: skip
 
 
+@pytest.mark.nightly
 @pytest.mark.browser
 def test_from_the_start_to_verified_gains_by_clicks(rig: Rig, tmp_path: Path) -> None:
     rig.start("plant_node", *NAMED, **LOOP)

@@ -37,6 +37,7 @@ def told(subject, asked: DesignRequest) -> str:
     return f"kc {subject.shaped(asked).gains.kc:.4f}"
 
 
+@pytest.mark.nightly
 def test_the_slider_by_keyboard_alone_and_a_page_that_is_loaded_again(browser, url, subject):
     tab = browser.tab(url)
     assert shown(tab).startswith(told(subject, DesignRequest()))
@@ -59,6 +60,7 @@ def test_the_slider_by_keyboard_alone_and_a_page_that_is_loaded_again(browser, u
     assert tab.said == []
 
 
+@pytest.mark.long
 def test_kinds_rules_and_weight_by_mouse(browser, url, subject):
     tab = browser.tab(url)
     shown(tab)
@@ -86,6 +88,7 @@ def test_kinds_rules_and_weight_by_mouse(browser, url, subject):
     assert tab.said == []
 
 
+@pytest.mark.long
 def test_two_pages_do_not_disturb_each_other(browser, url, subject):
     first, second = browser.tab(url), browser.tab(f"{url}#ms=1.7&controller=pi&rule=robust")
     expected = told(subject, DesignRequest(controller="pi", ms=1.7))
@@ -150,6 +153,7 @@ def test_a_narrow_page_does_not_scroll_sideways_and_dark_is_dark(browser, url, d
         assert 0 <= top < 844, part
 
 
+@pytest.mark.long
 def test_on_a_phone_the_tabs_of_two_tunes_are_no_wider_than_it(browser, subject):
     folder = "/home/operator/.ros/relay_autotune/20261127T035954Z_712b7c35"
     with served([subject, subject_of(analysed(), folder)]) as url:
@@ -203,6 +207,7 @@ def test_everything_that_acts_or_shows_has_a_name_for_a_screen_reader(browser, u
     assert any("highest" in name for name in found["image"])
 
 
+@pytest.mark.nightly
 def test_a_command_that_ended_is_told(browser, subject):
     with served([subject]) as url:
         tab = browser.tab(url)

@@ -22,6 +22,7 @@ from relay_autotune.web import server
 COMMANDS = {"replay": replay.main, "tune": tune.main}
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "words",
     [

@@ -229,6 +229,7 @@ def test_nobody_who_looks_does_not_make_what_is_new_grow(monkeypatch):
             time.sleep(0.01)
 
 
+@pytest.mark.long
 @pytest.mark.browser
 def test_the_page_of_a_loop_with_hostile_texts(tmp_path):
     live = Live(HOSTILE)
@@ -248,6 +249,7 @@ def test_the_page_of_a_loop_with_hostile_texts(tmp_path):
         assert tab.said == []
 
 
+@pytest.mark.long
 @pytest.mark.browser
 def test_an_open_page_draws_so_many_points_at_most_and_none_while_it_is_hidden(tmp_path):
     live = Live("/relay_node")
@@ -285,6 +287,7 @@ def test_an_open_page_draws_so_many_points_at_most_and_none_while_it_is_hidden(t
         tab.wait(f"Number(document.body.dataset.measured) >= {newest() - 1e-3}")
 
 
+@pytest.mark.long
 @pytest.mark.browser
 def test_long_numbers_of_a_figure_do_not_run_into_the_title_of_its_axis(tmp_path):
     live = Live("/relay_node")
@@ -309,6 +312,7 @@ def test_long_numbers_of_a_figure_do_not_run_into_the_title_of_its_axis(tmp_path
         assert "time [s]" not in tab.text("#plot-live-measurement")
 
 
+@pytest.mark.long
 @pytest.mark.browser
 def test_abort_is_in_reach_while_a_tune_runs_and_its_model_can_be_shaped_then(tmp_path):
     live = Live("/relay_node")
@@ -334,6 +338,7 @@ def test_abort_is_in_reach_while_a_tune_runs_and_its_model_can_be_shaped_then(tm
         assert tab.said == []
 
 
+@pytest.mark.nightly
 @pytest.mark.browser
 def test_on_a_phone_a_wish_shows_what_comes_of_it_and_a_model_stands_once(tmp_path):
     live = Live("/relay_node")
@@ -406,6 +411,7 @@ def test_on_a_phone_a_wish_shows_what_comes_of_it_and_a_model_stands_once(tmp_pa
         assert tab.said == []
 
 
+@pytest.mark.nightly
 @pytest.mark.browser
 def test_a_tune_without_gains_leaves_the_earlier_ones_grey_with_their_time(tmp_path):
     live = Live("/relay_node")
@@ -433,6 +439,7 @@ def test_a_tune_without_gains_leaves_the_earlier_ones_grey_with_their_time(tmp_p
         assert tab.said == []
 
 
+@pytest.mark.nightly
 @pytest.mark.browser
 def test_a_tune_that_was_aborted_does_not_show_the_gains_of_the_one_before(tmp_path):
     aborted = replace(analysed().record, outcome=Outcome.ABORTED, reason="a button")
@@ -445,6 +452,7 @@ def test_a_tune_that_was_aborted_does_not_show_the_gains_of_the_one_before(tmp_p
         assert tab.text("#gains") == "no gains"
 
 
+@pytest.mark.nightly
 @pytest.mark.browser
 def test_what_must_be_read_first_stands_first_and_a_finger_that_scrolls_moves_no_slider(
     tmp_path, monkeypatch
@@ -506,6 +514,7 @@ def test_what_is_wished_goes_to_the_loop_that_is_meant():
     assert (lives[0].next_wish(), lives[1].next_wish()) == (PageCommand("start"), None)
 
 
+@pytest.mark.nightly
 @pytest.mark.browser
 def test_each_loop_has_a_tab_and_every_one_that_runs_can_be_ended(tmp_path):
     lives = [Live("/tank/relay_node"), Live("/oven/relay_node")]

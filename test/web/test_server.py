@@ -36,6 +36,7 @@ def get(url: str, **headers: str):
         return error.code, dict(error.headers), error.read().decode()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "path",
     ["", "page.css", "page.js", "plot.js", "report.html?of=7", "gains/yaml", "nothing"],
@@ -82,6 +83,7 @@ def test_a_page_of_a_stranger_cannot_open_the_socket(url):
         conversation(url, headers={"Origin": "http://tank.example"})
 
 
+@pytest.mark.long
 def test_the_socket_tells_everything_and_answers(url, subject):
     first, answer, refused = conversation(
         url,
@@ -115,6 +117,7 @@ WISHES = (
 IMPOSSIBLE = ("1e300", "1e400", LONG, "-1", "NaN", "true", '"0.1"', "[]", "{}", "-1e-9")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -129,6 +132,7 @@ def test_each_number_has_the_range_of_its_declaration(url, name, value, capfd):
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wish", WISHES)
 def test_a_wish_that_cannot_be_ends_the_connection(subject, wish, capfd):
     live = Live("/relay_node")
@@ -147,6 +151,7 @@ def test_a_query_that_cannot_be_is_no_defect(url, query, capfd):
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.long
 def test_sockets_that_vanish_are_no_defect(url, capfd):
     host, port = url.removeprefix("http://").strip("/").split(":")
     for _ in range(20):
@@ -163,6 +168,7 @@ def test_sockets_that_vanish_are_no_defect(url, capfd):
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.nightly
 def test_no_page_waits_for_the_question_of_another_one(subject):
     class Slow(PageModel):
         begun, over = threading.Event(), False
@@ -186,6 +192,7 @@ def test_no_page_waits_for_the_question_of_another_one(subject):
         assert "shaped" in first.result()[1]["answer"]
 
 
+@pytest.mark.long
 def test_five_pages_at_once_have_answers_of_their_own(url):
     async def all_of_them():
         asked = [
@@ -198,6 +205,7 @@ def test_five_pages_at_once_have_answers_of_their_own(url):
     assert len(set(found)) == 5
 
 
+@pytest.mark.long
 def test_gains_are_kept_in_a_file(url):
     status, headers, text = get(url + "gains/yaml?asked=%7B%22ms%22%3A1.6%7D")
     assert status == 200
@@ -222,6 +230,7 @@ def test_the_report_has_the_gains_that_were_shaped(url, subject, monkeypatch):
     assert "replay 1.4" in text
 
 
+@pytest.mark.long
 def test_doubtful_gains_are_written_only_when_they_are_accepted(subject, monkeypatch):
     finding = replace(subject.shaping.findings[0], result=1, sentence="the data drift", remedy="x")
     doubtful = PageModel(subject.case, subject.shaping, subject.first, subject.command)

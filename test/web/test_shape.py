@@ -43,6 +43,7 @@ def subject(analysis):
     return subject_of(analysis)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "asked",
     [
@@ -69,6 +70,7 @@ def given(model: TransferFunction) -> PageModel:
     return PageModel(case, Shaping(task_of_model(model)), DesignRequest(), lambda _: "tune")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "model",
     [
@@ -95,6 +97,7 @@ def test_the_steps_are_those_of_an_exact_simulation(model):
     assert steps.low.size == 0
 
 
+@pytest.mark.long
 def test_the_band_holds_most_models_and_the_model_itself(subject):
     found = subject.shaped(DesignRequest())
     steps = found.steps
@@ -104,6 +107,7 @@ def test_the_band_holds_most_models_and_the_model_itself(subject):
     assert 0.0 < np.max(steps.high - steps.low) < 0.1
 
 
+@pytest.mark.long
 def test_calmer_gains_are_slower_and_all_positions_are_asked_once(subject):
     calm, fast = subject.shaped(DesignRequest(ms=1.2)), subject.shaped(DesignRequest(ms=2.0))
     assert calm.gains.ms < fast.gains.ms
@@ -215,6 +219,7 @@ def test_the_command_line_that_is_shown_gives_the_same_again(tmp_path):
     assert not again.web
 
 
+@pytest.mark.long
 def test_a_command_without_the_page_loads_nothing_of_it():
     code = (
         "import sys; from relay_autotune.cli import replay, tune; "

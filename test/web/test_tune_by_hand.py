@@ -13,6 +13,7 @@ from tools.report_images import live_tune
 pytestmark = pytest.mark.browser
 
 
+@pytest.mark.nightly
 def test_seven_taps_on_a_phone_lead_to_proven_gains_and_make_the_picture_of_the_readme(tmp_path):
     told = live_tune(tmp_path / "tune.gif", 390, 800)
     assert told["status"].startswith("proof passed")
