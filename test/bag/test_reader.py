@@ -253,7 +253,7 @@ def test_a_bag_cut_before_the_first_sample(tmp_path):
         read_experiments(tmp_path / "bag")
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("compression", "step"),
     [
@@ -438,7 +438,7 @@ def held(times, values, at):
     return np.array([values[np.flatnonzero(times <= t)[-1]] for t in at])
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 @given(data=st.data())
 @settings(max_examples=80, deadline=None)
 def test_the_input_of_a_foreign_pair_equals_its_commands(data, tmp_path_factory):

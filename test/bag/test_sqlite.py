@@ -175,7 +175,7 @@ def test_more_topics_than_a_recorder_has_are_refused(tmp_path):
     assert "declares more than 50000 topics" in said
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_many_topics_take_no_longer_and_are_not_paired(tmp_path):
     path = bag(tmp_path / "a.db3")
     database = sqlite3.connect(path)

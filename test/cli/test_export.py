@@ -98,7 +98,7 @@ def test_what_pid_controller_gets():
     }
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_an_export_says_what_was_predicted(capsys):
     asked = ["--law", "ardupilot_rate", "--pid", "--noise-std", "0.02", "--amplitude", "0.5"]
     for how in ("ardupilot_rate", "yaml"):
@@ -239,7 +239,7 @@ def test_numbers_of_numpy_are_written_like_any_other():
     assert "float64" not in text
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_replay_exports_the_gains_of_a_recording(capsys):
     bag = "bags/biased_relay"
     asked = ["--rule", "imc", "--loop-delay", "0.5", "--export", "pid_controller", "--dof", "oven"]

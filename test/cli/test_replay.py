@@ -75,6 +75,7 @@ def documents(text):
     return [json.loads(line, parse_constant=refuse) for line in text.splitlines()]
 
 
+@pytest.mark.long
 def test_the_table_says_what_a_person_needs(tmp_path, capsys, monkeypatch):
     # On a terminal it says meanwhile what the computation is at, so that it has to be one.
     monkeypatch.setattr("relay_autotune.cli.jobs.analyse", analysed_anew)
@@ -105,6 +106,7 @@ def test_the_table_says_what_a_person_needs(tmp_path, capsys, monkeypatch):
     assert max(map(len, out.splitlines()[1:])) < 100
 
 
+@pytest.mark.long
 def test_the_document_has_the_numbers_of_the_core_to_the_last_digit(tmp_path, capsys):
     record = relay_record()
     write_bag(tmp_path / "bag", tmp_path, record)
@@ -228,7 +230,7 @@ def test_a_foreign_recording_of_a_relay(tmp_path, capsys):
     assert experiment["gains"]
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_other_methods_and_rules(tmp_path, capsys):
     write_bag(tmp_path / "bag", tmp_path, relay_record())
     _, out, _ = run(capsys, "--json", "--method", "wang_biased", "--rule", "imc", tmp_path / "bag")
@@ -265,7 +267,7 @@ def step_csv(path, count=400, interval=0.5):
     return path
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_a_csv_and_the_bag_made_of_it_give_equal_numbers(tmp_path, capsys):
     path = step_csv(tmp_path / "step.csv")
     columns = ("--time", "Time (s)", "--measurement", "Level [m]", "--command", "Valve (%)")
@@ -581,6 +583,7 @@ UNWANTED = {
 }
 
 
+@pytest.mark.long
 def test_nothing_is_imported_that_a_bag_of_ours_does_not_need(tmp_path):
     write_bag(tmp_path / "bag", tmp_path, relay_record())
     code = (

@@ -146,7 +146,7 @@ def test_tests_that_were_aborted_give_no_gains():
     assert found.reason == "the experiment was aborted: no gains. a hand did it"
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_rules_for_fopdt_take_that_of_the_method():
     known = Known(structure="fopdt")
     found = analyse_jointly((unbiased(), unbiased(8.0)), method="li", rule="simc", known=known)

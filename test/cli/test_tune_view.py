@@ -291,7 +291,7 @@ def test_the_flags_of_the_next_command_give_what_the_identifier_was_asked_for() 
     assert job.task == Task("chang", "imc", known_from(values), options_from(values))
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_a_report_of_a_tune_is_what_the_identifier_would_say(monkeypatch, tmp_path) -> None:
     only(monkeypatch, "uncertainty")
     page = str(tmp_path / "page.html")

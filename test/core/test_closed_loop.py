@@ -25,7 +25,7 @@ MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)
 PI, PID = Controller(0.67, 21.1), Controller(0.7, 16.0, 3.7, 0.37, 0.6)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 @pytest.mark.parametrize("gains", [PI, PID])
 def test_the_responses_tend_to_the_continuous_ones(gains):
     setpoint, load = Loop(gains, MODEL).step_responses(400.0, 1 << 14)

@@ -165,7 +165,7 @@ def test_structures_are_weighted_by_akaikes_criterion():
     assert max(support(stable)[1:]) > 0.1  # a richer structure counts beside the chosen FOPDT
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 @pytest.mark.parametrize(("structure", "seed"), [("fopdt", 0), ("", 0), ("", 1)])
 def test_a_load_that_walks_at_random_beside_a_relay_test(structure, seed):
     """A tenth of the error of least squares, which bends gain and dead time to the load."""

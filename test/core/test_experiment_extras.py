@@ -148,7 +148,7 @@ def test_a_given_amplitude_beyond_the_ends_of_the_actuator_never_completes(
     assert command == baseline
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 @pytest.mark.parametrize("share", [0.1, 0.6, 0.2, 0.4])
 @pytest.mark.parametrize("std", [0.002, 0.02])
 @pytest.mark.parametrize("known", [Known(structure="fopdt"), Known()], ids=["fopdt", "chosen"])

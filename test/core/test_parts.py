@@ -50,7 +50,7 @@ def test_parts_that_agree_stay_as_they_are(first):
     assert agreed(()) == ()
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 @pytest.mark.parametrize(("gain", "verdict"), [(2.5, Verdict.DOUBTFUL), (-1.65, Verdict.NONE)])
 def test_of_parts_that_contradict_each_other_none_is_trusted(first, gain, verdict):
     other = part(gain, 2)

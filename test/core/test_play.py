@@ -71,6 +71,7 @@ def test_play_is_estimated_where_a_level_is_reached_from_both_sides():
     assert any(f"play of {found.play:.3g} u" in text for text in found.warnings)
 
 
+@pytest.mark.nightly
 def test_no_play_is_found_where_there_is_none():
     assert identify(record_of(UP_AND_DOWN)).play == 0.0
 

@@ -69,6 +69,7 @@ def test_a_load_at_the_begin_of_the_test_is_left_out(load_time, load_size):
     check(run(load_time=load_time, load_size=load_size, noise_std=0.01), rel=0.03)
 
 
+@pytest.mark.nightly
 def test_a_load_that_comes_later_is_borne():
     tune = run(load_time=180.0, load_size=0.3, noise_std=0.01, min_cycles=4, max_cycles=20)
     assert "a load came during the test" in tune.reason
@@ -105,7 +106,7 @@ def test_a_load_that_stops_the_oscillation_is_borne():
     check(tune, rel=0.03)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 @pytest.mark.parametrize(("load_time", "load_size"), [(90.0, 0.8), (110.0, 1.5)])
 def test_a_load_that_stops_the_first_cycle_is_borne(load_time, load_size):
     tune = run(load_time=load_time, load_size=load_size, noise_std=0.01, max_cycles=20)
@@ -142,6 +143,7 @@ def test_a_slow_heater_with_steps_of_three_tenths_of_a_degree(noise_std):
     assert gain_of(tune) == pytest.approx(ultimate_point(HEATER).gain, rel=0.02)
 
 
+@pytest.mark.nightly
 def test_a_slow_heater_finds_its_amplitude():
     limits = {"command_min": -30.0, "command_max": 50.0}
     tune = run(HEATER, period=2.0, amplitude=0.0, quantisation=0.3, **limits)
@@ -206,6 +208,7 @@ def test_integrating_unstable_and_reverse_acting(structure, shape, truth):
         assert gain_of(tune, structure) == pytest.approx(truth, rel=0.05)
 
 
+@pytest.mark.nightly
 def test_a_process_that_comes_to_rest_only_after_the_start():
     plant = VirtualProcess(PROCESS, disturbances=Disturbances(noise_std=0.01), seed=2)
     # It still moves from a command of before.

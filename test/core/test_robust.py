@@ -105,6 +105,7 @@ def test_the_least_ms_on_an_unstable_process(ratio, pi, pid):
     assert search.least_ms(derivative=True) == pytest.approx(pid, rel=0.015)
 
 
+@pytest.mark.long
 @pytest.mark.nightly
 def test_an_infeasible_bound_is_relaxed_with_a_warning():
     model = UNSTABLE_FOPDT.build((2.0, 3.0, 0.9))
@@ -181,7 +182,7 @@ def test_95_percent_of_the_models_around_keep_the_bound():
         assert peaks[37] == pytest.approx(1.4, abs=2e-3)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_bounds_that_can_just_be_kept_on_the_models_around_are_kept():
     rng = np.random.default_rng(0)
     gains, lags, delays = np.array([0.09, 0.005, 0.009])[:, None] * rng.standard_normal((3, 100))

@@ -231,7 +231,7 @@ def test_a_structure_that_is_not_in_the_data_can_be_forced():
 
 
 @pytest.mark.long
-@pytest.mark.long
+@pytest.mark.nightly
 @pytest.mark.parametrize("seed", range(3))
 def test_no_rival_rings_faster_than_the_samples_show(seed):
     """In noise, a resonance between two samples fits as well as none, and has any height."""

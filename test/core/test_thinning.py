@@ -165,7 +165,7 @@ def test_an_analysis_says_so_and_designs_for_single_samples():
     assert found.added_delay == pytest.approx(0.5 * 0.0333 + 0.5 * 0.033334, rel=1e-4)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_what_a_first_order_leaves_of_means_is_not_taken_for_jitter():
     # It leaves a thousandth of the range, which means of three samples do not hide.
     rng = np.random.default_rng(2)

@@ -156,6 +156,7 @@ def test_rivals_have_support():
     assert found.support + sum(r.support for r in found.rivals) <= 1.0 + 1e-9
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("loss", ["huber", "tukey"])
 def test_a_robust_loss_withstands_outliers_that_squares_do_not(loss):
     truth = np.array((1.65, 20.0, 10.0))

@@ -123,6 +123,7 @@ def test_a_dead_zone_is_the_lower_end_of_what_is_answered():
     assert found.ends[0] == pytest.approx(2.0, abs=0.15)
 
 
+@pytest.mark.nightly
 def test_effects_are_told_apart_where_there_are_levels_on_both_sides():
     """The first of a hundred levels is near their end: all others are on one side of it."""
     rng, time = np.random.default_rng(0), np.arange(2000.0)

@@ -151,6 +151,7 @@ def _staircase(seed: int = 0) -> tuple[np.ndarray, np.ndarray, Record]:
     return time, y, Record(time, y, u(time), held_input=u)
 
 
+@pytest.mark.nightly
 def test_any_held_input_and_irregular_samples_will_do():
     _, _, record = _staircase()
     found = identify_waveform(record)
@@ -197,6 +198,7 @@ def test_a_record_cut_out_of_an_oscillation(start):
     assert found.values == pytest.approx([1.65, 20.0, 10.0], rel=1e-6)
 
 
+@pytest.mark.nightly
 def test_a_second_input_shows_in_the_residual_and_is_said():
     time, y, record = _staircase()
     other = PiecewiseConstant(np.array([40.0, 130.0]), np.array([1.0, 0.0]), 0.0)
@@ -301,7 +303,7 @@ def test_ljung_box_is_uniform_for_white_noise_and_small_for_coloured():
     assert math.isnan(ljung_box(np.array([1.0, 2.0])))
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 @pytest.mark.parametrize(("length", "number"), [(3, 20), (1, 9), (2, 20)])
 def test_spikes_of_the_sensor_are_left_out_and_told(length, number):
     process = (1.65, 20.0, 10.0)
@@ -528,6 +530,7 @@ def test_a_process_that_falls_is_found_in_a_record_far_longer_than_its_fall():
     assert model.gain == pytest.approx(-0.58, rel=0.05)
 
 
+@pytest.mark.nightly
 def test_where_a_coarse_sensor_drops_out_nothing_is_fitted():
     """What the model leaves there would count as what it does not explain."""
     rng = np.random.default_rng(2)
@@ -554,6 +557,7 @@ def test_a_fast_process_that_answers_a_pulse_is_no_sensor_that_drops_out():
     assert not any("left out" in w for w in found.warnings)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("late", "hides"), [(4.5, True), (1.0, False)])
 def test_a_command_that_is_recorded_late_hides_the_dead_time(late, hides):
     time = np.arange(0.0, 400.0, 0.5)
@@ -570,6 +574,7 @@ def test_a_command_that_is_recorded_late_hides_the_dead_time(late, hides):
         assert identify_waveform(record).model.dead_time == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.nightly
 def test_an_ultimate_point_beyond_the_rate_of_the_samples_is_not_determined():
     time = np.arange(0.0, 20.0, 0.1)
     u = PiecewiseConstant(np.array([2.0, 9.0]), np.array([1.0, 0.0]), 0.0)

@@ -125,6 +125,7 @@ def whole() -> str:
     return page([case_of(completed(), "tank"), case_of(fruitless(), HOSTILE)])
 
 
+@pytest.mark.long
 def test_it_is_one_well_formed_file_that_loads_nothing(whole: str) -> None:
     found = read(whole)
     assert found.elements.count("html") == 1
@@ -211,7 +212,7 @@ def test_what_does_not_shake_the_verdict_does_not_head_the_page(
     assert "a load step of -0.211 u" in read(page([case])).text
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_without_gains_the_reason_stands_in_their_place() -> None:
     case = replace(case_of(aborted(), "tank"), record=None, models_around=())
     found = read(page([case]))

@@ -101,6 +101,7 @@ def test_an_address_with_impossible_wishes_shows_the_first_gains(browser, url, s
     assert shown(tab).startswith(told(subject, DesignRequest()))
 
 
+@pytest.mark.long
 def test_hostile_names_are_text(browser, subject):
     with served([hostile(subject), subject]) as url:
         tab = browser.tab(url)

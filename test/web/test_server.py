@@ -205,7 +205,7 @@ def test_five_pages_at_once_have_answers_of_their_own(url):
     assert len(set(found)) == 5
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_gains_are_kept_in_a_file(url):
     status, headers, text = get(url + "gains/yaml?asked=%7B%22ms%22%3A1.6%7D")
     assert status == 200
