@@ -379,6 +379,21 @@ def test_a_slow_law_is_read_backward_through_a_rounded_command():
     assert read_backward(record, model, y - left + slow) > 0.8
 
 
+def test_a_joint_under_its_controller_is_not_the_law_read_backward():
+    """Within the means of a slow pole's response the joint answers, and tells the command."""
+    interval, n, rng = 0.004, 8000, np.random.default_rng(0)
+    lags = 400.0, 0.15
+    plant = VirtualProcess(TransferFunction.sopdt(2000.0, lags, 0.0))
+    y, u = np.zeros(n), np.zeros(n)
+    for k in range(n):
+        y[k] = plant.measure(interval * k) + 1e-3 * rng.standard_normal()
+        u[k] = 2.5 * (k // 1000 % 2 - y[k])
+        plant.command(float(u[k]))
+    record = Record(time=interval * np.arange(n), measurement=y, command=u)
+    model = TransferFunction.sopdt(1800.0, lags, 0.0)
+    assert read_backward(record, model, response(model, record.time, record.input())) < 0.1
+
+
 @pytest.mark.parametrize("command", ["slow", "random"])
 def test_a_command_from_outside_is_not_fed_back(command):
     """Nor is it where the process follows at once, so that its inverse explains the command."""
