@@ -140,7 +140,6 @@ def test_unknown_names_are_refused_at_once():
 
 
 @pytest.mark.long
-@pytest.mark.long
 @pytest.mark.parametrize("kind", ["noise", "two level", "constant", "ramp", "huge", "walk"])
 @settings(deadline=None, max_examples=3)
 @given(

@@ -297,7 +297,6 @@ def _record(
 
 
 @pytest.mark.long
-@pytest.mark.long
 @pytest.mark.parametrize("share", [pytest.param(0.0, marks=pytest.mark.nightly), 0.2])
 @pytest.mark.parametrize("model", [PROCESSES[k] for k in (0, 3, 5, 7, 1, 2, 4, 8)], ids=str)
 def test_records_with_gain_and_dead_time_known(model, share):

@@ -171,7 +171,6 @@ def test_of_both_levels_clipped_alike_only_gains_that_hold_are_trusted(known, sh
 
 
 @pytest.mark.nightly
-@pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 2])
 def test_levels_that_the_actuator_does_not_reach_show_beside_the_smaller_ones(seed):
     """The gains have to hold before and after the last growth: their Ms had been up to 1.49."""

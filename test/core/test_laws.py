@@ -293,7 +293,6 @@ def test_responses_and_figures_are_those_of_a_simulation(model, ti, period):
 
 
 @pytest.mark.nightly
-@pytest.mark.long
 @pytest.mark.parametrize("name", ["pid_controller", "ardupilot_rate"])
 def test_a_law_far_faster_than_its_loop_has_the_effort_of_its_simulation(name):
     """So many samples are not computed one by one, and the derivative kicks in a few of them."""

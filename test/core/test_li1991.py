@@ -106,7 +106,6 @@ def _records(
 
 
 @pytest.mark.long
-@pytest.mark.long
 @pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.nightly), 0.01])
 @pytest.mark.parametrize("epsilon", [pytest.param(0.0, marks=pytest.mark.nightly), 0.2])
 @pytest.mark.parametrize(

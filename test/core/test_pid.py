@@ -330,7 +330,6 @@ def test_the_command_that_is_expected_holds_what_the_noise_does(rate):
 
 
 @pytest.mark.nightly
-@pytest.mark.long
 # The largest deviation by a load takes up noise, which makes its comparison looser.
 @pytest.mark.parametrize(("step", "less"), [(Step(setpoint=1.0), 0.2), (Step(load=1.0), 0.06)])
 def test_the_least_step_is_where_the_noise_begins_to_decide(step, less):

@@ -50,7 +50,6 @@ def test_methods_for_an_ideal_relay_step_aside(method):
 
 
 @pytest.mark.nightly
-@pytest.mark.long
 @pytest.mark.parametrize(
     "model",
     [TransferFunction.fopdt(1.65, 20.0, 10.0), INTEGRATOR_LAG.build((0.5, 2.0, 1.0))],

@@ -105,7 +105,6 @@ def test_the_least_ms_on_an_unstable_process(ratio, pi, pid):
     assert search.least_ms(derivative=True) == pytest.approx(pid, rel=0.015)
 
 
-@pytest.mark.long
 @pytest.mark.nightly
 def test_an_infeasible_bound_is_relaxed_with_a_warning():
     model = UNSTABLE_FOPDT.build((2.0, 3.0, 0.9))

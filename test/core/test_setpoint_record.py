@@ -23,7 +23,6 @@ PERIOD = 0.02
 
 
 @pytest.mark.long
-@pytest.mark.long
 @pytest.mark.parametrize("dead_time", [0.4, 0.9])
 def test_the_process_is_told_from_its_controller_read_backward(dead_time):
     model = TransferFunction.fopdt(2.0, 1.0, dead_time)

@@ -198,7 +198,6 @@ def test_without_noise_the_true_structure_is_found_exactly(name):
 
 
 @pytest.mark.nightly
-@pytest.mark.long
 @pytest.mark.parametrize(("name", "seed"), IN_NOISE)
 def test_in_noise_the_choice_gives_the_ultimate_point(name, seed):
     model = PROCESSES[name]
@@ -230,7 +229,6 @@ def test_a_structure_that_is_not_in_the_data_can_be_forced():
     assert any("is correlated" in w for w in found.warnings)
 
 
-@pytest.mark.long
 @pytest.mark.nightly
 @pytest.mark.parametrize("seed", range(3))
 def test_no_rival_rings_faster_than_the_samples_show(seed):

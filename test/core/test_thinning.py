@@ -62,7 +62,6 @@ def test_what_is_analysed_is_bounded_however_long_and_whatever_the_command(shape
 
 
 @pytest.mark.nightly
-@pytest.mark.long
 @pytest.mark.parametrize("shape", ["steps", "sine", "noise", "step"])
 def test_the_model_is_that_of_all_samples_within_its_interval(shape):
     rng = np.random.default_rng(2)
