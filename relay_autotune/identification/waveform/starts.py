@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from relay_autotune.identification.waveform.rational import Inputs, columns_of, 
 from relay_autotune.identification.waveform.separable import (
     TRIAL,
     Trial,
+    evaluate,
     information_criterion,
     predicted_cost,
     refine,
@@ -34,7 +35,7 @@ from relay_autotune.identification.waveform.separable import (
 )
 from relay_autotune.process.factors import Quadratic
 from relay_autotune.process.response import response
-from relay_autotune.process.structures import Structure
+from relay_autotune.process.structures import FOPDT, Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.excitation import answering_time, changes_within
@@ -138,6 +139,8 @@ _ROUNDS = ((5, 99), (16, 3))
 _HOPELESS, _CLEAN = 6.0, 1e-6
 # Slow lags of an inverse response at the start, relative to the fast one.
 _SLOWER = (2.0, 6.0, 20.0)
+# Damping at the start of what rings, and its least number of periods in the record.
+_RINGING, _SWINGS = 0.05, 3
 # Dampings at the start; shares of the dead time that fast lags have, and what a zero leaves of it.
 _DAMPINGS, _SHARES_OF_FAST, _HIDDEN = (1.35, 0.9, 0.4), (0.3, 0.7, 3.0), 0.3
 # Largest share of the samples at which a relay switches. Where a command changes more often, only
@@ -467,12 +470,14 @@ class Guess:
     :param frequency: at which starts have its response, about that of a relay's oscillation
         [rad/s].
     :param shortest: least time of a start [s].
+    :param ringing: at which most of what it leaves oscillates [rad/s].
     """
 
     tau: float
     dead_time: float
     frequency: float
     shortest: float
+    ringing: float
 
     @classmethod
     def of(cls, problem: Problem, fopdt: Trial) -> Guess:
@@ -486,7 +491,8 @@ class Guess:
         tau, least = min(math.exp(float(fopdt.theta[0])), 3.0 * longest), 0.1 * shortest
         dead_time = max(float(fopdt.theta[1]), least)
         point = ultimate_point(TransferFunction.fopdt(1.0, tau, dead_time))
-        return cls(tau, dead_time, 1.0 / longest if point is None else point.frequency, least)
+        frequency = 1.0 / longest if point is None else point.frequency
+        return cls(tau, dead_time, frequency, least, _ringing(problem, fopdt))
 
     def equal_lags(self, order: int) -> tuple[float, float]:
         """Return tau and D of n equal lags with the FOPDT's response at one frequency [s]."""
@@ -500,7 +506,8 @@ class Guess:
         """Return starts of a structure: all its lags alike, or one slow and the others fast.
 
         The slow one is the FOPDT's, or an integrator; the fast ones take their share of its dead
-        time, or are longer. A zero can look like a dead time, or hide it.
+        time, or are longer. A pair that hardly damps is found only from near its frequency, with
+        which the FOPDT's error oscillates. A zero can look like a dead time, or hide it.
 
         :param structure: any that does not grow by itself.
         """
@@ -509,13 +516,16 @@ class Guess:
             return [np.array([self.dead_time])]
         found = []
         stable = not structure.integrators
-        one_kind = len(factors) == 1 and not isinstance(factors[0], Quadratic)
+        may_ring = any(isinstance(f, Quadratic) for f in factors)
         if stable:
             tau, dead_time = self.equal_lags(structure.order)
-            for zeta in _DAMPINGS[:1] if one_kind else _DAMPINGS:
-                pairs = ([tau, zeta] if isinstance(f, Quadratic) else [tau] for f in factors)
-                found.append(np.array([*map(math.log, itertools.chain(*pairs)), dead_time]))
-        if not (stable and one_kind):
+            alike = [(tau, zeta, dead_time) for zeta in _DAMPINGS[: None if may_ring else 1]]
+            if may_ring:
+                alike.append((1.0 / self.ringing, _RINGING, self.shortest))
+            for lag, zeta, later in alike:
+                pairs = ([lag, zeta] if isinstance(f, Quadratic) else [lag] for f in factors)
+                found.append(np.array([*map(math.log, itertools.chain(*pairs)), later]))
+        if may_ring or len(factors) > 1 or not stable:
             for slow in range(len(factors)) if stable else [-1]:
                 for share in _SHARES_OF_FAST[:1] if stable else _SHARES_OF_FAST:
                     fast = max(share * self.dead_time, self.shortest)
@@ -538,6 +548,21 @@ class Guess:
             return [np.array((math.log(self.tau), self.dead_time))]
         slow = (ratio * self.tau for ratio in _SLOWER)
         return [np.array((*_two_lags(large, self.tau), self.dead_time)) for large in slow]
+
+
+def _ringing(problem: Problem, fopdt: Trial) -> float:
+    """Return the frequency at which most of what a FOPDT leaves oscillates [rad/s].
+
+    :param problem: the samples.
+    :param fopdt: its best fit.
+    """
+    part = max(problem.experiments, key=lambda p: p.stop - p.start)
+    left = evaluate(replace(problem, structure=FOPDT), fopdt.theta).residual[part]
+    time = problem.time[part]
+    even = np.linspace(time[0], time[-1], time.size)
+    power = np.abs(np.fft.rfft(np.interp(even, time, left) * np.hanning(time.size)))
+    power[:_SWINGS] = 0.0
+    return 2.0 * math.pi * max(int(np.argmax(power)), _SWINGS) / float(np.ptp(time))
 
 
 def _two_lags(large: float, small: float) -> list[float]:
