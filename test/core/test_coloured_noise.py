@@ -35,7 +35,7 @@ from relay_autotune.identification.waveform.residuals import Colour, colour_cost
 from relay_autotune.identification.waveform.separable import evaluate
 from relay_autotune.identification.waveform.starts import start_fopdt
 from relay_autotune.process.response import response
-from relay_autotune.process.structures import FOPDT, LAG_COMPLEX, THREE_LAGS
+from relay_autotune.process.structures import FOPDT, LAG_COMPLEX, SOPDT, THREE_LAGS
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.cycles import find_relay, infer_settings
@@ -236,6 +236,18 @@ def test_a_process_that_visibly_rested_needs_no_past():
     best = _compared(context, NOTHING, TRIED, None)[0]
     assert best.model.gain > 0.0
     assert not any(nuisances_of(best.problem)[1:])
+
+
+def test_a_fit_begins_at_the_frequency_of_what_rings():
+    """The least of a pair that hardly damps is half a turn of the whole record wide."""
+    time, u = np.arange(0.0, 42.0, 0.02), PiecewiseConstant(np.array([1.5]), np.ones(1), 0.0)
+    pole = 1.0 / complex(0.24, 7.996)
+    process = TransferFunction(0.34, (), (pole, pole.conjugate()), 0, 0.15)
+    context = FitContext.of(
+        problem_of([(time, response(process, time, u), u)], FOPDT), 0, held=False
+    )
+    begin = [math.exp(-theta[0]) for theta in context.guess.starts(SOPDT)]
+    assert min(abs(w - 8.0) for w in begin) * 42.0 < math.pi
 
 
 def test_the_simulation_shows_the_direction(monkeypatch):
