@@ -488,9 +488,11 @@ def _choose(table: TextTable, wanted: Selection) -> tuple[int | None, list[int]]
         _named(table, names[at])
     if len({time, *pair}) < 3:
         chosen = [names[at] for at in (time, *pair) if at is not None]
+        no_time = "; where there is no time, give the sampling period with --period S"
+        untimed = no_time if time in pair else ""
         raise SelectionError(
             f"time, measurement and command must be three columns of {table.path}, "
-            f"found {listed(chosen)}"
+            f"found {listed(chosen)}{untimed}"
         )
     return time, pair
 

@@ -114,9 +114,11 @@ class TextTable:
             delimiter=separator,
             skipinitialspace=separator != "\t",
         )
-        # Line and text of the first number with a decimal comma, and of the first with a point.
-        self._comma: tuple[int, str] | None = None
-        self._point: tuple[int, str] | None = None
+        # Line and text of each column's first number with a decimal comma, and of the first with a
+        # point; and the columns whose points part no thousands.
+        self._comma: dict[int, tuple[int, str]] = {}
+        self._point: dict[int, tuple[int, str]] = {}
+        self._decimal: set[int] = set()
         # The units behind the numbers of each column.
         self._behind: dict[int, str] = {}
         self._head: list[str] = []
@@ -333,8 +335,12 @@ class TextTable:
                     f"{self.path}: of {len(lines)} cells of {self.names[time]!r} {count} are "
                     f"{what}, the others not; expected one of them"
                 )
-        if self._comma and self._point:
-            comma, point = (f"{c!r} in line {n}" for n, c in (self._comma, self._point))
+        both = self._comma.keys() & self._point.keys()
+        if self._comma:
+            both |= self._point.keys() - self._decimal
+        for at in both:
+            first = self._comma.get(at) or next(iter(self._comma.values()))
+            comma, point = (f"{c!r} in line {n}" for n, c in (first, self._point[at]))
             raise BagError(
                 f"{self.path} has numbers with a decimal comma and others with a point, such as "
                 f"{comma} and {point}; expected one of them"
@@ -409,9 +415,12 @@ class TextTable:
         if self._separator != ",":
             # "1.234,5" is neither.
             if "," in text and "." not in text and text.count(",") == 1:
-                text, self._comma = text.replace(",", "."), self._comma or (line, cell)
+                text = text.replace(",", ".")
+                self._comma.setdefault(at, (line, cell))
             elif "." in text:
-                self._point = self._point or (line, cell)
+                self._point.setdefault(at, (line, cell))
+                if not _GROUPS.fullmatch(text):
+                    self._decimal.add(at)
         if not _is_number(text):
             raise self._no_number(line, at, cell)
         value = float(text)

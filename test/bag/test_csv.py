@@ -58,8 +58,11 @@ def test_more_columns_are_named(tmp_path):
         read_experiments(unclear)
     with pytest.raises(SelectionError, match=r"no column 'x'; its columns are 'n', 't', 'y'"):
         read_experiments(path, Selection("x", "u"))
-    with pytest.raises(SelectionError, match="must be three columns"):
+    with pytest.raises(SelectionError, match=r"must be three columns.*'y', 'y'$"):
         read_experiments(path, Selection("y", "y"))
+    two = write(tmp_path / "c.csv", "y,u\n0,1\n1,2\n")
+    with pytest.raises(SelectionError, match="no time, give the sampling period with --period S"):
+        read_experiments(two, Selection("y", "u"))
     with pytest.raises(BagError, match=r"line 2: 'note' is 'ok'; expected a number"):
         read_experiments(path, Selection("note", "u", "t"))
 
@@ -189,6 +192,10 @@ def test_dates_in_seconds_become_the_start(tmp_path):
             "a decimal comma and others with a point, such as '1,5' in line 2 and '1.5' in line 3",
         ),
         (
+            "t;y;u\n0;1,5;2.000\n1;1,6;3.000\n",
+            "a decimal comma and others with a point, .* '1,5' in line 2 and '2.000' in line 2",
+        ),
+        (
             "t;y;u\n0;1.000,5;2\n1;2;2\n",
             r"line 2: 'y' is '1.000,5'; expected a number; save .*thousands",
         ),
@@ -272,6 +279,13 @@ def test_separators_and_decimal_commas(tmp_path, separator, point, said):
     found = read_experiments(write(tmp_path / "a.csv", text))
     same_as_plain(tmp_path, found)
     assert list(found.notes) == said
+
+
+def test_each_column_has_its_own_decimal_mark(tmp_path):
+    """As a program writes it that takes the mark of its times alone from the country."""
+    rows = (line(k, ";", ".").split(";") for k in range(20))
+    text = "t;y;u\n" + "\n".join(f"{t.replace('.', ',')};{y};{u}" for t, y, u in rows)
+    same_as_plain(tmp_path, read_experiments(write(tmp_path / "a.csv", text)))
 
 
 def test_a_header_may_be_missing(tmp_path):
