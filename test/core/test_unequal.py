@@ -146,3 +146,8 @@ def test_a_level_that_is_held_for_long_counts_as_many_short_ones():
     assert middle_of(u) == 0.5
     held = PiecewiseConstant(np.append(u.times, 1200.0), np.append(levels, 0.0), 0.0)
     assert middle_of(held) == 0.0
+
+
+def test_the_middle_of_commands_about_zero_is_zero():
+    u = PiecewiseConstant(np.array([1.0, 2.0]), np.array([0.1 + 0.2, -0.3]), -0.3)
+    assert middle_of(u) == 0.0

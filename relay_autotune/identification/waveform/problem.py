@@ -493,7 +493,9 @@ def middle_of(u: Input) -> float:
     seldom = min(lasting[u.levels < u.initial].sum(), lasting[u.levels > u.initial].sum())
     if seldom >= _ONE_SIDE * lasting.sum():
         return u.initial
-    return 0.5 * (float(u.levels.min()) + float(u.levels.max()))
+    middle = 0.5 * (float(u.levels.min()) + float(u.levels.max()))
+    # Not what rounding leaves of 0.
+    return middle if abs(middle) > NEGLIGIBLE * float(np.ptp(u.levels)) else 0.0
 
 
 def distance(u: Input, level: float) -> PiecewiseConstant:
