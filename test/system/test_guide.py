@@ -61,6 +61,7 @@ def plant_shown(page: str, note: str) -> dict[str, Any]:
     return values
 
 
+@pytest.mark.nightly
 def test_the_tutorial_is_followed_to_its_end_without_the_ros2_command(rig: Rig) -> None:
     """A test in real time: a busy machine disturbs the loop, so the verdict is not checked.
 
