@@ -339,8 +339,8 @@ class TextTable:
         if self._comma:
             both |= self._point.keys() - self._decimal
         for at in both:
-            first = self._comma.get(at) or next(iter(self._comma.values()))
-            comma, point = (f"{c!r} in line {n}" for n, c in (first, self._point[at]))
+            seen = self._comma.get(at) or next(iter(self._comma.values())), self._point[at]
+            comma, point = (f"{c!r} in line {n}" for n, c in seen)
             raise BagError(
                 f"{self.path} has numbers with a decimal comma and others with a point, such as "
                 f"{comma} and {point}; expected one of them"
