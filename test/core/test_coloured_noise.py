@@ -331,6 +331,7 @@ def test_without_spikes_the_search_goes_on_from_what_was_found():
     assert again.problem.relaxation
 
 
+@pytest.mark.nightly
 def test_a_step_that_came_just_before_the_record_leaves_no_endless_dead_time():
     """Gain and dead time cannot be told apart; draws of 1e9 s took the gains for ever."""
     time = 0.02 * np.arange(170.0)

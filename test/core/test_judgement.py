@@ -442,6 +442,7 @@ def test_a_relay_whose_levels_are_clipped_on_one_side_gives_no_trusted_gains():
     assert clipped.result is not Result.PASSED
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("shown", "result"), [(150.0, Result.PASSED), (2.0, Result.DOUBTFUL)])
 def test_a_loop_slower_than_what_the_record_shows_is_doubtful(record, gains, shown, result):
     found = fitted_as(PROCESS, record)

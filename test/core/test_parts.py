@@ -62,7 +62,7 @@ def test_of_parts_that_contradict_each_other_none_is_trusted(first, gain, verdic
     assert "in part 1 and" in found[0].judgement.reason
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_a_part_without_gains_contradicts_none(first):
     refused = replace(part(-1.65, 2), gains=())
     assert agreed((first, refused)) == (first, refused)
