@@ -335,10 +335,11 @@ class TextTable:
                     f"{self.path}: of {len(lines)} cells of {self.names[time]!r} {count} are "
                     f"{what}, the others not; expected one of them"
                 )
-        both = self._comma.keys() & self._point.keys()
+        unclear = self._comma.keys() & self._point.keys()
         if self._comma:
-            both |= self._point.keys() - self._decimal
-        for at in both:
+            # Beside a decimal comma, a point may part thousands.
+            unclear |= self._point.keys() - self._decimal
+        for at in unclear:
             seen = self._comma.get(at) or next(iter(self._comma.values())), self._point[at]
             comma, point = (f"{c!r} in line {n}" for n, c in seen)
             raise BagError(
@@ -417,7 +418,7 @@ class TextTable:
             if "," in text and "." not in text and text.count(",") == 1:
                 text = text.replace(",", ".")
                 self._comma.setdefault(at, (line, cell))
-            elif "." in text:
+            elif "." in text and at not in self._decimal:
                 self._point.setdefault(at, (line, cell))
                 if not _GROUPS.fullmatch(text):
                     self._decimal.add(at)
