@@ -20,7 +20,7 @@ from relay_autotune.identification.waveform.candidates import Candidate, FitCont
 from relay_autotune.identification.waveform.fit_covariance import Fit
 from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem, with_terms_of
 from relay_autotune.identification.waveform.separable import Trial, errors_in_simulation
-from relay_autotune.process.structures import UNSTABLE_FOPDT, UNSTABLE_SOPDT
+from relay_autotune.process.structures import FOPDT, UNSTABLE_FOPDT, UNSTABLE_SOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 
 # Stretches of a record: enough for ranks, and each longer than its errors are correlated.
@@ -36,8 +36,8 @@ def opposed(context: FitContext, fit: Fit) -> float:
     """
     model = fit.problem.structure.model_at(fit.state.theta, fit.state.coefficients)
     assert model is not None
-    white = replace(with_terms_of(fit.problem, context.problem), colour=None)
-    inside = replace(context, problem=white)
+    beside = replace(with_terms_of(fit.problem, context.problem), structure=FOPDT, colour=None)
+    inside = replace(context, problem=beside)
     found = _answered_earlier(inside, fit, model) if model.dead_time > 0.0 else 0.0
     return max(found, _outgrown(inside, fit, model)) if context.bounded else found
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,7 +35,7 @@ from relay_autotune.identification.waveform.separable import (
 )
 from relay_autotune.process.factors import Quadratic
 from relay_autotune.process.response import response
-from relay_autotune.process.structures import FOPDT, Structure
+from relay_autotune.process.structures import Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.excitation import answering_time, changes_within
@@ -519,8 +519,9 @@ class Guess:
         may_ring = any(isinstance(f, Quadratic) for f in factors)
         if stable:
             tau, dead_time = self.equal_lags(structure.order)
-            alike = [(tau, zeta, dead_time) for zeta in _DAMPINGS[: None if may_ring else 1]]
+            alike = [(tau, _DAMPINGS[0], dead_time)]
             if may_ring:
+                alike += [(tau, zeta, dead_time) for zeta in _DAMPINGS[1:]]
                 alike.append((1.0 / self.ringing, _RINGING, self.shortest))
             for lag, zeta, later in alike:
                 pairs = ([lag, zeta] if isinstance(f, Quadratic) else [lag] for f in factors)
@@ -553,12 +554,12 @@ class Guess:
 def _ringing(problem: Problem, fopdt: Trial) -> float:
     """Return the frequency at which most of what a FOPDT leaves oscillates [rad/s].
 
-    :param problem: the samples.
+    :param problem: the problem with its FOPDT structure.
     :param fopdt: its best fit.
     """
     part = max(problem.experiments, key=lambda p: p.stop - p.start)
-    left = evaluate(replace(problem, structure=FOPDT), fopdt.theta).residual[part]
-    time = problem.time[part]
+    # The fit may have had other samples: those of a first dead time are left out later.
+    time, left = problem.time[part], evaluate(problem, fopdt.theta).residual[part]
     even = np.linspace(time[0], time[-1], time.size)
     power = np.abs(np.fft.rfft(np.interp(even, time, left) * np.hanning(time.size)))
     power[:_SWINGS] = 0.0
