@@ -255,7 +255,6 @@ def test_a_process_that_changed_is_drawn_as_each_half_shows_it():
     assert not any("two parts of the record" in text for text in same.warnings)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("dead_time", [3.063, 3.064, 3.065])
 def test_parts_that_differ_as_much_as_their_noise_are_not_told(dead_time):
     found = in_parts(joined(PROCESS, TransferFunction.fopdt(2.0, 10.0, dead_time)))

@@ -63,7 +63,6 @@ def check(tune, rel=0.05):
     assert gain_of(tune) == pytest.approx(ULTIMATE_GAIN, rel=rel)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("load_time", "load_size"), [(60.0, -0.4), (110.0, 0.3)])
 def test_a_load_at_the_begin_of_the_test_is_left_out(load_time, load_size):
     check(run(load_time=load_time, load_size=load_size, noise_std=0.01), rel=0.03)
@@ -135,7 +134,6 @@ def test_a_sensor_that_speaks_only_on_change():
     check(run(quantisation=0.02, noise_std=0.02, keep=lambda k, y, last: y != last))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("noise_std", [0.05, 0.0])
 def test_a_slow_heater_with_steps_of_three_tenths_of_a_degree(noise_std):
     tune = run(HEATER, period=2.0, amplitude=20.0, quantisation=0.3, noise_std=noise_std)

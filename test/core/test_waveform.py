@@ -259,7 +259,6 @@ def test_exchanged_columns_of_a_test_by_steps_are_named(exchanged):
     assert ("the wrong way round" in told) == exchanged
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("seed", [8, 0, 2, 11])
 def test_noise_shows_no_response_whichever_fits_to_it_run_off(seed):
     """With 0 that turns on the last digit, in 2 and 8 all do, and 11 has none to begin with."""
@@ -333,7 +332,6 @@ def test_samples_of_a_step_that_the_model_misses_are_no_spikes():
     assert not any("spikes" in w for w in found.warnings)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("seed", range(8))
 def test_clean_records_have_no_outliers(seed):
     found = identify_waveform(_noisy(_run(1.65, 20.0, 10.0), 0.1, seed), FOPDT)
