@@ -260,7 +260,7 @@ class Modes:
             centre = nodes[0]
             if group.count(group[0]) < len(group):
                 centre = sum(nodes) / len(nodes)
-                scale = abs(centre) or 1.0
+                scale = max(abs(centre), *(abs(e - centre) for e in nodes))
                 terms = _terms(nodes, centre, scale, _term_count(nodes, centre, horizon))
             share = 2.0 if paired else 1.0
             self._clusters.append(_Cluster(nodes, centre, share, terms, scale, rows))

@@ -56,6 +56,8 @@ def _by_superposition(model, time, u):
 MODELS = {
     "fopdt": TransferFunction.fopdt(1.65, 20.0, 10.0),
     "eight equal lags": TransferFunction.lag_n(1.0, 6.0, 8, 0.6),
+    # The mean of its poles and the step's is all rounding.
+    "lag and growth alike": TransferFunction(1.0, (), (32.0, -32.0 * (1.0 + 1e-15)), 0, 0.5),
     "nearly equal lags": TransferFunction(1.0, (), (1.0, 1.0001, 1.1), 0, 0.5),
     "lags nearly apart": TransferFunction(1.0, (), (1.0, 1.0, 1.11, 1.11, 1.23, 1.23), 0, 0.5),
     "a pair near a lag": TransferFunction(1.0, (), (2.0, 2.0 + 0.15j, 2.0 - 0.15j), 0, 0.5),
