@@ -132,6 +132,9 @@ _CLEAR = 1.02
 # A bound counts as kept up to this factor; frequencies are added to the grid at most so often.
 _HELD, _MOST_ADDED = 1.0 + 1e-4, 6
 _UNLIMITED = 0.1
+# Phase that derivative action adds with a good margin [rad], highest frequency at which it is looked
+# for over w_u, their number, and how far the grid's middle stays below it.
+_LEAD, _HIGHEST, _FREQUENCIES, _ABOVE = math.pi / 6.0, 1e5, 200, 100.0
 # The range of gains of the continuous loop is left by this factor at a sampling period.
 _WIDER = 1.6
 # An integral that is advanced before the output takes at most this part of kp' from kp.
@@ -197,7 +200,12 @@ class Search:
         """Frequency about which the loop is closed [rad/s]."""
         point = ultimate_point(self.late)
         if point is not None:
-            return point.frequency
+            # Two slow lags turn the phase as two integrators do, which derivative action holds at
+            # frequencies far above.
+            higher = point.frequency * np.geomspace(1.0, _HIGHEST, _FREQUENCIES)
+            phase = self.late.phase(higher)
+            held = higher[np.count_nonzero(phase >= phase[0] - _LEAD) - 1]
+            return max(point.frequency, float(held) / _ABOVE)
         constants = [abs(c) for c in (*self.late.time_constants, self.late.dead_time) if c]
         return 1.0 / min(constants, default=1.0)
 

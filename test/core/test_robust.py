@@ -273,6 +273,19 @@ def test_models_of_a_far_longer_dead_time_slow_the_loop_down():
     assert max(analyse_loop(gains, m).ms for m in others) == pytest.approx(1.4, rel=0.02)
 
 
+@pytest.mark.parametrize("lag", [3e3, 1e4, 3e4, 1e6])
+def test_an_integrator_with_a_long_lag_gets_the_gains_of_two_integrators(lag):
+    """Far above w_u: "nothing limits the gain" was said of it, or the gains were not numbers."""
+    options = DesignOptions(controller="pid", mt=1.4)
+    found = []
+    for constant in (300.0, lag):
+        process = TransferFunction(38.8 * constant, (), (constant,), 1, 0.017)
+        gains = robust(DesignTask(model=process, options=options))[0]
+        found.append(analyse_loop(gains, process))
+    assert found[1].ms == pytest.approx(1.4, rel=1e-3)
+    assert found[1].iae_load == pytest.approx(found[0].iae_load, rel=0.06)
+
+
 def test_a_grid_of_one_frequency_shows_no_crossing():
     """Far above half of the sampling rate a loop has no other frequency."""
     found = first_crossing(np.ones((1, 4, 1)), np.ones((1, 4, 1)), np.ones(1))
