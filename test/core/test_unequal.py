@@ -12,16 +12,28 @@ from scipy.integrate import odeint
 from relay_autotune import Known
 from relay_autotune.control.controller import PidController
 from relay_autotune.identification.methods import identify
-from relay_autotune.identification.waveform.problem import middle_of
+from relay_autotune.identification.waveform.candidates import FitContext
+from relay_autotune.identification.waveform.problem import middle_of, problem_of
 from relay_autotune.loop.gains import Controller
 from relay_autotune.process.response import response
-from relay_autotune.process.structures import SOPDT, UNSTABLE_FOPDT
+from relay_autotune.process.structures import FOPDT, SOPDT, UNSTABLE_FOPDT, UNSTABLE_SOPDT
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.process.virtual_process import Disturbances, VirtualProcess
 from relay_autotune.record.record import PiecewiseConstant, Record
 
 pytestmark = pytest.mark.long
+
+
+def _held(process, gains, setpoint, time, noise, seed):
+    """Return time, measurement and command of a process under its controller."""
+    plant = VirtualProcess(process, disturbances=Disturbances(noise_std=noise), seed=seed)
+    controller, rows = PidController(gains, 0.0), []
+    for t in time:
+        y = plant.measure(t)
+        rows.append((t, y, controller.step(t, setpoint(t), y)))
+        plant.command(rows[-1][-1])
+    return np.array(rows).T
 
 
 @pytest.mark.nightly
@@ -35,16 +47,50 @@ pytestmark = pytest.mark.long
 def test_what_a_controller_keeps_from_running_away_is_no_integrator(gains, moves):
     """It was given an integrator with a zero, and gains that make the loop unstable."""
     process = UNSTABLE_FOPDT.build((1.0, 10.0, 1.0))
-    plant = VirtualProcess(process, disturbances=Disturbances(noise_std=0.02), seed=7)
-    controller, setpoint, rows = PidController(gains, 0.0), 0.0, []
-    for t in np.arange(0.0, 80.0, 0.2):
-        setpoint = next((y for at, y in moves.items() if 0.0 <= t - at < 0.2), setpoint)
-        y = plant.measure(t)
-        rows.append((t, y, controller.step(t, setpoint, y)))
-        plant.command(rows[-1][-1])
-    found = identify(Record(*np.array(rows).T))
+
+    def setpoint(t):
+        return next((y for at, y in reversed(moves.items()) if t >= at), 0.0)
+
+    found = identify(Record(*_held(process, gains, setpoint, np.arange(0.0, 80.0, 0.2), 0.02, 7)))
     assert found.model.structure == "unstable_fopdt"
     assert found.model.gain == pytest.approx(process.gain, rel=0.02)
+
+
+def test_a_proportional_controller_read_backward_makes_no_other_model_hopeless():
+    """The measurement "follows the command within one sample" was said of each such record."""
+    process = UNSTABLE_SOPDT.build((1.0, 10.0, 1.5, 1.0))
+    levels = np.random.default_rng(0).uniform(-1.0, 1.0, 6)
+    # The integral time is long enough for a controller without one.
+    time, measured, sent = _held(
+        process,
+        Controller(1.7, 1e6),
+        lambda t: 0.0 if t < 30.0 else levels[int(t - 30.0) // 60],
+        np.arange(0.0, 300.0, 1.0),
+        0.02,
+        0,
+    )
+    found = identify(Record(time, measured, sent))
+    assert found.model.structure == "unstable_sopdt"
+    assert found.model.gain == pytest.approx(process.gain, rel=0.02)
+    assert found.model.time_constants[0].real == pytest.approx(-10.0, rel=0.02)
+
+
+def test_ends_of_an_actuator_do_not_stand_for_two_lags_of_which_one_grows():
+    """A pendulum was given ends in place of its growth, and gains with which it falls."""
+    process = UNSTABLE_SOPDT.build((1.0, 7.1, 5.4, 1.3))
+    time, measured, sent = _held(
+        process,
+        Controller(4.5, 80.0, 4.0, 0.4),
+        lambda t: 1.0 if 18.0 < t < 45.0 else -0.5 if t > 45.0 else 0.0,
+        np.arange(0.0, 74.0, 0.125),
+        0.05,
+        2,
+    )
+    record = Record(time, measured, sent)
+    problem = problem_of([(time, measured / np.ptp(measured), record.drive())], FOPDT)
+    context = FitContext.of(problem, 0, held=False)
+    (simple,) = context.fit(["sopdt"])
+    assert context.ends is not None and not context.with_terms(simple, ("ends",))
 
 
 @pytest.mark.nightly

@@ -65,6 +65,7 @@ from relay_autotune.process.structures import (
     TABLE,
     THREE_LAGS,
     UNSTABLE_FOPDT,
+    UNSTABLE_SOPDT,
     Structure,
 )
 from relay_autotune.process.transfer_function import TransferFunction
@@ -329,11 +330,17 @@ class FitContext:
             problem, state = (
                 (problem, state) if again is state else _with_terms_in_place(problem, again)
             )
-        if "ends" in terms and self.bounded and state.cost >= self.unstable.cost:
+        if "ends" in terms and self.bounded and self._grows_as_well(state.cost):
             # What a controller keeps from growing looks as if large commands were not answered.
             return []
         other = self.candidate(problem, state)
         return [] if other is None else [other]
+
+    def _grows_as_well(self, cost: float) -> bool:
+        """Return whether a process that grows by itself leaves no more than a sum of squares."""
+        problems = (replace(self.problem, structure=s) for s in (UNSTABLE_FOPDT, UNSTABLE_SOPDT))
+        fits = (self._best_fit(p, cost / p.time.size) for p in problems)
+        return any(fit is not None and fit.cost <= cost for fit in fits)
 
     def with_a_load(self, candidate: Candidate) -> list[Candidate]:
         """Return a candidate with a step of the load, another one in place of its own; or none.
@@ -438,7 +445,7 @@ class FitContext:
         }
         # The least mean square so far.
         least = math.inf
-        found: list[Candidate | None] = []
+        found: list[Candidate] = []
         for name in names:
             if name in same:
                 found.append(same[name])
@@ -452,10 +459,13 @@ class FitContext:
                     # Another structure needed them.
                     problem = without(problem, wrong)
                     state = self._best_fit(problem, least)
-                if state is not None:
-                    least = min(least, max(state.cost, self.floor) / problem.time.size)
-                    found.append(self.candidate(problem, state))
-        return [c for c in found if c is not None]
+                candidate = None if state is None else self.candidate(problem, state)
+                if candidate is not None:
+                    # What is none, such as a controller read backward, makes no other hopeless.
+                    left = max(candidate.state.cost, self.floor)
+                    least = min(least, left / problem.time.size)
+                    found.append(candidate)
+        return found
 
     def of_opposite_sign(self) -> list[Candidate]:
         """Return models of the direction opposite to the relay's, with an inverse response.

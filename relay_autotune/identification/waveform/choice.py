@@ -222,13 +222,18 @@ def _on_more_samples(context: FitContext, found: list[Candidate]) -> list[Candid
 
 
 def _require_dynamics(context: FitContext, found: Sequence[Candidate]) -> None:
-    """Raise an error where a response within one sample explains most, and no candidate does."""
+    """Raise an error where a response within one sample explains most, and no candidate more."""
     problem, fopdt = context.problem, context.fopdt
     thinned = float(np.median(np.diff(problem.index))) > 1.0
     if thinned or unit_steps(FOPDT, fopdt.theta)[-1] > problem.shortest:
         return
     left, total = rms_in_simulation(problem, fopdt.coefficients, fopdt.theta)
-    if left < 0.5 * total and all(mean_square_left(c) > _WORSE * left**2 for c in found):
+    least = min(map(mean_square_left, found), default=math.inf)
+    gain = math.log(max(left**2, NEGLIGIBLE**2)) - math.log(max(least, NEGLIGIBLE**2))
+    # In a colour, a model leaves more in simulation and is no worse.
+    coloured = bool(found) and found[0].problem.colour is not None
+    needed = -math.log(_WORSE) if coloured else ANSWERED / problem.time.size
+    if left < 0.5 * total and gain < needed:
         raise IdentificationError(
             "the measurement follows the command within one sample, "
             f"{digits(problem.shortest, 2)} s, and shows no dynamics: sample faster; where a "
