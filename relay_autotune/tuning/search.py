@@ -132,8 +132,8 @@ _CLEAR = 1.02
 # A bound counts as kept up to this factor; frequencies are added to the grid at most so often.
 _HELD, _MOST_ADDED = 1.0 + 1e-4, 6
 _UNLIMITED = 0.1
-# Phase that derivative action adds with a good margin [rad], highest frequency at which it is looked
-# for over w_u, their number, and how far the grid's middle stays below it.
+# Phase that derivative action adds with a good margin [rad]; where the frequency is sought at
+# which a process is that much later, in ultimate frequencies; how far below it a design may be.
 _LEAD, _HIGHEST, _FREQUENCIES, _ABOVE = math.pi / 6.0, 1e5, 200, 100.0
 # The range of gains of the continuous loop is left by this factor at a sampling period.
 _WIDER = 1.6

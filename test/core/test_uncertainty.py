@@ -19,7 +19,7 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import Part
 from relay_autotune.identification.waveform.candidates import Candidate
-from relay_autotune.identification.waveform.determination import _combinations
+from relay_autotune.identification.waveform.determination import _combinations, advice
 from relay_autotune.identification.waveform.fit_covariance import Fit, quantisation_step
 from relay_autotune.identification.waveform.posterior import (
     _allowed,
@@ -113,6 +113,16 @@ def _stepped(held: float, noise: float, process: TransferFunction) -> Record:
     u = PiecewiseConstant(at, np.array([1.0, 0.0, 1.0]), 0.0)
     y = response(process, time, u) + np.random.default_rng(1).normal(0.0, noise, time.size)
     return Record(time=time, measurement=y, command=u(time), held_input=u)
+
+
+def test_steps_are_advised_for_a_time_even_where_a_zero_takes_off_more_than_all_small_lags():
+    """A time below zero was said."""
+    process = TransferFunction(1.0, zeros=(9.0,), time_constants=(20.0, 2.0), dead_time=1.0)
+    found = identify(_stepped(80.0, 0.15, process), "waveform", Known(structure="sopdt_zero"))
+    uncertain = replace(found, ultimate_frequency_std=math.inf)
+    (told,) = [a for a in advice(uncertain, [_stepped(80.0, 0.15, process)]) if "to and fro" in a]
+    held = re.search(r"held for about (-?[0-9.]+) s", told)
+    assert held is not None and float(held[1]) > process.dead_time
 
 
 @pytest.mark.parametrize("held", [15.0, 80.0])

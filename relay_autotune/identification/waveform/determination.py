@@ -128,7 +128,8 @@ def _for_fast(found: Identification, names: Sequence[str], tests: _Tests) -> lis
             f"most: the time between samples is {digits(tests.interval, 2)} s"
         )
     elif not tests.relay:
-        half = 2.0 * _apparent_dead_time(found.model)
+        # Whatever of them cancels, a command held about twice as long shows.
+        half = 2.0 * max(longest, fast)
         if found.ultimate_frequency_std < found.ultimate_frequency:
             half = math.pi / found.ultimate_frequency
         said.append(
