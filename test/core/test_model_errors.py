@@ -11,17 +11,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from relay_autotune.analysis import analyse
 from relay_autotune.identification.estimate import Estimate
-from relay_autotune.identification.judgement.difference import Difference, widened
+from relay_autotune.identification.judgement.difference import Difference, difference, widened
+from relay_autotune.identification.methods import identify
 from relay_autotune.identification.result import identified
-from relay_autotune.loop.analysis import Loop
+from relay_autotune.loop.analysis import Loop, analyse_loop
 from relay_autotune.loop.gains import Controller
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.process.model_set import ModelErrors, ModelSet
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.record.record import PiecewiseConstant
+from relay_autotune.record.record import PiecewiseConstant, Record
 from relay_autotune.tuning.ensemble import ms_on_each
 from relay_autotune.tuning.robust import robust
 from relay_autotune.tuning.task import DesignTask
@@ -75,6 +77,29 @@ def test_the_ms_with_an_error_is_that_of_the_process(period, kc, stable):
     (truth,) = ms_on_each(law, ModelSet((TRUTH,), period))
     assert math.isfinite(truth) == stable
     assert found == pytest.approx(truth, rel=5e-3)
+
+
+@pytest.mark.long
+def test_a_resonance_that_outlasts_the_model_is_shown_beside_it():
+    """A fifth of a flexible link's answer was noise, and the gains had an Ms of 35 with it."""
+    fast, noise = 0.03, 0.003
+    pairs = [
+        [complex(damping, side * math.sqrt(1.0 - damping**2)) / w for side in (1.0, -1.0)]
+        for w, damping in ((15.5, 0.15), (14.0, 0.15))
+    ]
+    link = TransferFunction(1.0, tuple(pairs[0]), (fast, *pairs[1]), 0, 0.017)
+    time = 0.005 * np.arange(2000)
+    command = np.where(time < 0.5, 0.0, np.where(time < 5.0, 1.0, 0.2))
+    y = response(link, time, PiecewiseConstant.from_samples(time, command))
+    y += noise * np.random.default_rng(0).standard_normal(time.size)
+    record = Record(time, y, command)
+    found = identify(record)
+    assert found.model.response_time < 0.1
+    shown = difference(found, record)
+    assert shown is not None
+    assert shown.residual == pytest.approx(noise, rel=0.4)
+    gains = analyse(record).best_gains
+    assert gains is not None and analyse_loop(gains, link).ms < 1.4
 
 
 def test_the_design_holds_on_the_models_with_their_errors():

@@ -21,7 +21,9 @@ a part of the response as well: a share of the draws has it as such, by the odds
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +32,12 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.identification.result import Identification
 from relay_autotune.identification.waveform.posterior import DRAWS
-from relay_autotune.identification.waveform.residuals import Colour, colour_cost, colour_of
+from relay_autotune.identification.waveform.residuals import (
+    IMITATES_A_DRIFT,
+    Colour,
+    colour_cost,
+    colour_of,
+)
 from relay_autotune.identification.waveform.separable import residual_of
 from relay_autotune.process.model_set import ModelErrors
 from relay_autotune.process.response import response
@@ -39,8 +46,9 @@ from relay_autotune.record.record import PiecewiseConstant, Record
 
 _BINS = 48
 _MOST_COMPARED = 2000
-# Responses of the model in which the prior decays.
-_DECAY = 3.0
+# Responses of the model in which the prior decays: a resonance beside a fast lag outlasts it, but
+# so does what imitates a slow disturbance.
+_DECAYS = (3.0, 12.0)
 # Ratios of the powers of difference and noise, of which the most likely one is taken.
 _RATIOS = np.concatenate(([0.0], np.geomspace(1e-3, 1e12, 61)))
 _TURNS = 2
@@ -176,11 +184,12 @@ def _difference(found: Identification, record: Record) -> Difference | None:
     # and alike where the lags are (a kernel of correlated decay, Chen, Ohlsson and Ljung 2012; in
     # the form of Matern, since the response to what lies between two frequencies of the command
     # differs little from that to both).
-    size = lag / whole * np.exp(-lag / (_DECAY * whole))
+    sizes = (lag / whole * np.exp(-lag / (decay * whole)) for decay in _DECAYS)
     ratio = math.sqrt(3.0) * np.abs(np.subtract.outer(np.log(lag), np.log(lag)))
     alike = (1.0 + ratio) * np.exp(-ratio) + 1e-9 * np.eye(lag.size)
-    prior = size[:, None] * np.linalg.cholesky(alike)
-    shown = _posterior(left[known], nuisances[:, known], moved, prior)
+    root = np.linalg.cholesky(alike)
+    priors = [size[:, None] * root for size in sizes]
+    shown = _posterior(left[known], nuisances[:, known], moved, priors)
     residual = math.sqrt(float(np.mean(shown.left**2)))
     w = found.ultimate_frequency
     pieces = record.duration * (w if math.isfinite(w) else 1.0 / whole) / _A_PIECE
@@ -197,7 +206,7 @@ def _difference(found: Identification, record: Record) -> Difference | None:
         curve, size = nuisances[2, known], np.diff(u.levels)[u.times == begin]
         curve = np.where(at < begin, 0.0, curve - np.interp(begin, at, curve))
         response_too = np.vstack((nuisances[:2, known], curve))
-        other = _posterior(left[known], response_too, moved, prior)
+        other = _posterior(left[known], response_too, moved, priors)
         share = 1.0 / (1.0 + math.exp(min(0.5 * (other.unlikely - shown.unlikely), 700.0)))
         late = np.diff(np.interp(begin + edges, at, curve)) / size
     return Difference(edges, shown.mean, shown.root, residual, unexplained, lowest, late, share)
@@ -234,7 +243,10 @@ class _Posterior:
 
 
 def _posterior(
-    left: FloatArray, nuisances: FloatArray, moved: FloatArray, prior: FloatArray
+    left: FloatArray,
+    nuisances: FloatArray,
+    moved: FloatArray,
+    priors: Sequence[FloatArray],
 ) -> _Posterior:
     """Return the posterior of increments in the most likely colour of the noise.
 
@@ -244,14 +256,17 @@ def _posterior(
     :param left: residual of the simulation [y], shape (n,).
     :param nuisances: curves of any size, shape (p, n).
     :param moved: responses to an increment each, shape (m, n).
-    :param prior: root of their relative covariance, shape (m, m).
+    :param priors: roots of their relative covariances, each less likely than the one before
+        unless the samples show it, shape (m, m).
     """
     basis = np.linalg.svd(nuisances, full_matrices=False)[2]
     found = []
-    for colour in (colour_of([left - (left @ basis.T) @ basis]), None):
+    noise_alone = colour_of([left - (left @ basis.T) @ basis])
+    for (k, prior), colour in itertools.product(enumerate(priors), (noise_alone, None)):
         for _ in range(_TURNS):
-            found.append(_in_colour(colour, left, nuisances, moved, prior))
-            colour = colour_of([found[-1].left])
+            shown = _in_colour(colour, left, nuisances, moved, prior)
+            found.append(replace(shown, unlikely=shown.unlikely + k * IMITATES_A_DRIFT))
+            colour = colour_of([shown.left])
     return min(found, key=lambda f: f.unlikely)
 
 
