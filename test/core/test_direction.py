@@ -106,6 +106,21 @@ def test_a_step_that_begins_with_the_record_keeps_its_direction(zero, before):
     assert found.model.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.1)
 
 
+@pytest.mark.parametrize(("up", "down"), [(0.12, 0.4), (0.1, 0.6)])
+def test_a_process_of_two_speeds_keeps_its_direction_under_a_square_wave(up, down):
+    """Half a period later the other direction has the speeds as they are, and each was refused."""
+    step, half = 0.01, 2.93
+    time = step * np.arange(2400)
+    command = np.where(np.floor(time / half) % 2.0 == 1.0, 80.0, 0.0)
+    y = np.zeros(time.size)
+    for i, u in enumerate(command[:-1]):
+        y[i + 1] = y[i] + step / (up if u else down) * (-0.16 * u - y[i])
+    y = 0.09 * np.round((y + 0.02 * np.random.default_rng(0).standard_normal(y.size)) / 0.09)
+    found = analyse(Record(time, y, command))
+    assert found.model is not None and found.model.model.process_sign == -1
+    assert found.verdict is Verdict.TRUSTED
+
+
 @pytest.mark.nightly
 def test_half_a_period_more_of_dead_time_is_no_other_direction():
     """The first answers came late, for which a model of the wrong sign had been trusted."""

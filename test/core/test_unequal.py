@@ -197,3 +197,17 @@ def test_a_level_that_is_held_for_long_counts_as_many_short_ones():
 def test_the_middle_of_commands_about_zero_is_zero():
     u = PiecewiseConstant(np.array([1.0, 2.0]), np.array([0.1 + 0.2, -0.3]), -0.3)
     assert middle_of(u) == 0.0
+
+
+def test_a_command_that_is_hardly_ever_followed_shows_no_end():
+    """A balancing robot was trusted with three samples as all that its motor had answered."""
+    rng, time = np.random.default_rng(0), 0.03 * np.arange(400.0)
+    command = np.where(time < 0.24, 8.0, np.repeat(rng.standard_normal(80), 5))
+    process = FOPDT.of_fields(gain=1.5, time_constants=[0.3], dead_time=0.06)
+    felt = PiecewiseConstant.from_samples(time, np.maximum(command, 6.4))
+    measured = response(process, time, felt) + 0.01 * rng.standard_normal(time.size)
+    u = Record(time, measured, command).drive()
+    context = FitContext.of(problem_of([(time, measured, u)], FOPDT), 0, held=False)
+    assert context.problem.time_within(6.4, np.inf) < 0.03
+    (simple,) = context.fit(["fopdt"])
+    assert context.ends is not None and not context.with_terms(simple, ("ends",))

@@ -21,6 +21,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.identification.waveform.problem import (
     NEGLIGIBLE,
+    ONE_SIDE,
     TERMS,
     Problem,
     nuisances_of,
@@ -47,6 +48,7 @@ from relay_autotune.identification.waveform.starts import (
     coarse,
     is_controlled,
     is_unobservable,
+    latest_dead_time,
     latest_dead_times,
     likeliest_ends,
     longest_push,
@@ -264,7 +266,11 @@ class FitContext:
             # Commands may lose their effect on one side, but not act the other way there.
             "unequal": min(problem.effects(found)) >= 0.0,
             "ends": problem.ends is None
-            or (high - low >= least and (math.isfinite(low) or math.isfinite(high))),
+            or (
+                high - low >= least
+                and (math.isfinite(low) or math.isfinite(high))
+                and problem.time_within(low, high) >= ONE_SIDE
+            ),
             "friction": not problem.friction or problem.dry_friction(found) >= least,
             "play": not problem.play or least <= problem.play_of(found) <= most,
         }
@@ -600,25 +606,36 @@ def likeliest_load(problem: Problem, state: Trial) -> float:
 
 
 def needs_no_past(problem: Problem, sign: int) -> bool:
-    """Return whether a record of a few steps shows that the process was at rest before.
+    """Return whether a record shows that the process was at rest before.
 
     A free past explains any single step. Many moves tell of themselves whether one is needed: a
     command that moved just before the record acts in the rest, or after it where the dead time is
-    longer. A relay test began where its settings say, and is asked of its samples all the same.
+    longer. The latter is a coincidence where a motion follows the first move sooner than the rest
+    lasted. A relay test began where its settings say, and is asked of its samples all the same.
 
     :param problem: all samples.
     :param sign: the direction in which the relay worked, 1 or -1; 0: not known.
     """
+    parts = [
+        (problem.time[part], problem.y[part], u)
+        for part, u in zip(problem.experiments, problem.inputs, strict=True)
+    ]
     return (
         not sign
-        and moves_seldom(problem)
+        and (moves_seldom(problem) or all(_answers_soon(*part) for part in parts))
         and all(
             # A command that is known to have held until the first sample is such a rest, too.
-            (isinstance(u, PiecewiseConstant) and u.times[0] == problem.time[part][0])
-            or begins_at_rest(problem.time[part], problem.y[part], u)
-            for part, u in zip(problem.experiments, problem.inputs, strict=True)
+            (isinstance(u, PiecewiseConstant) and u.times[0] == time[0])
+            or begins_at_rest(time, y, u)
+            for time, y, u in parts
         )
     )
+
+
+def _answers_soon(time: FloatArray, y: FloatArray, u: Input) -> bool:
+    """Return whether a measurement moves sooner after the first change than it had rested."""
+    rested = float(np.min(changes_within(u, time), initial=math.inf) - time[0])
+    return min(latest_dead_time(time, y, u, sign) for sign in (-1, 1)) < rested
 
 
 def moves_seldom(problem: Problem) -> bool:

@@ -34,8 +34,9 @@ _INSTANTS = 60
 # Least play, friction or shift of an end that counts, as a share of the command's range: the steps
 # of a sensor look like a tenth.
 _LEAST = 0.01
-# Share of the time on one side of a command that tells nothing of the effect there.
-_ONE_SIDE = 0.05
+# Share of the time on one side of a command, or within an actuator's ends, that tells nothing of
+# the effect there.
+ONE_SIDE = 0.05
 
 
 # Its arrays have no equality of their own.
@@ -198,6 +199,13 @@ class Problem:
         gain = float(coefficients[0]) or math.nan
         low, high = coefficients[self.places("ends")] / gain
         return self.ends[0] + float(low), self.ends[1] + float(high)
+
+    def time_within(self, low: float, high: float) -> float:
+        """Return the share of the samples at which held commands are between two levels."""
+        parts = zip(self.inputs, self.experiments, strict=True)
+        held = [u(self.time[at]) for u, at in parts if isinstance(u, PiecewiseConstant)]
+        levels = np.concatenate(held)
+        return float(np.mean((levels > low) & (levels < high)))
 
     def moved(self, coefficients: FloatArray) -> Problem:
         """Return the problem with its load and ends where a fit says that they are.
@@ -491,7 +499,7 @@ def middle_of(u: Input) -> float:
     typical = float(gaps.mean()) if gaps.size else 1.0
     lasting = np.array([typical, *gaps, typical])
     seldom = min(lasting[u.levels < u.initial].sum(), lasting[u.levels > u.initial].sum())
-    if seldom >= _ONE_SIDE * lasting.sum():
+    if seldom >= ONE_SIDE * lasting.sum():
         return u.initial
     middle = 0.5 * (float(u.levels.min()) + float(u.levels.max()))
     # Not what rounding leaves of 0.
