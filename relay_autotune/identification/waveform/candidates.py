@@ -345,7 +345,7 @@ class FitContext:
     def _grows_as_well(self, cost: float) -> bool:
         """Return whether a process that grows by itself leaves no more than a sum of squares."""
         problems = (replace(self.problem, structure=s) for s in (UNSTABLE_FOPDT, UNSTABLE_SOPDT))
-        fits = (self._best_fit(p, cost / p.time.size) for p in problems)
+        fits = (self._best_fit(p, math.inf) for p in problems)
         return any(fit is not None and fit.cost <= cost for fit in fits)
 
     def with_a_load(self, candidate: Candidate) -> list[Candidate]:
@@ -530,11 +530,14 @@ class FitContext:
             return self.fopdt
         if known and problem.structure == UNSTABLE_FOPDT:
             return self.unstable
+        zero, key = problem.structure.zero, _key_of_fit(problem)
+        if zero is None and key in self._fits:
+            return self._fits[key]
         state = multistart(problem, self._starts(problem, self.guess), least)
-        if problem.structure.zero is not None:
+        if zero is not None:
             return self._with_zero_on_either_side(problem, state, least)
         if state is not None:
-            self._fits[_key_of_fit(problem)] = state
+            self._fits[key] = state
         return state
 
     def _with_zero_on_either_side(
@@ -552,7 +555,7 @@ class FitContext:
         """
         structure = problem.structure
         without_it = replace(problem, structure=replace(structure, zero=None))
-        within = self._fits.get(_key_of_fit(problem)) or self._best_fit(without_it, least)
+        within = self._best_fit(without_it, least)
         if within is None or (state is not None and state.cost < within.cost):
             return state
         aside = np.append(np.zeros(within.theta.size - 1), _ASIDE)
