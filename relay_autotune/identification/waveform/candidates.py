@@ -166,6 +166,9 @@ class FitContext:
     _fits: dict[tuple[object, ...], Trial] = field(default_factory=dict, repr=False)
     _growing: dict[str, list[FloatArray]] = field(default_factory=dict, repr=False)
 
+    def __post_init__(self) -> None:
+        self._fits[_key_of_fit(self.problem)] = self.fopdt
+
     @classmethod
     def of(cls, problem: Problem, sign: int, *, held: bool) -> FitContext:
         """Return the context of a record's samples.
@@ -191,12 +194,6 @@ class FitContext:
     def length(self) -> float:
         """Length of the record [s]."""
         return float(np.ptp(self.problem.time))
-
-    @cached_property
-    def unstable(self) -> Trial:
-        """The best fit of an unstable FOPDT."""
-        problem = replace(self.problem, structure=UNSTABLE_FOPDT)
-        return best_of(problem, self._starts(problem, self.guess))
 
     @cached_property
     def latest(self) -> tuple[float, float]:
@@ -397,8 +394,6 @@ class FitContext:
 
         :param problem: of this context, with a FOPDT structure.
         """
-        if not any(nuisances_of(problem)):
-            return self.fopdt
         key = _key_of_fit(problem)
         if key not in self._fits:
             starts = [self.fopdt.theta, *start_fopdt(problem, self.sign)]
@@ -525,11 +520,6 @@ class FitContext:
 
     def _best_fit(self, problem: Problem, least: float) -> Trial | None:
         """Return the best fit of a structure; None where it is hopeless beside the least one."""
-        known = nuisances_of(problem) == nuisances_of(self.problem)
-        if known and problem.structure == FOPDT:
-            return self.fopdt
-        if known and problem.structure == UNSTABLE_FOPDT:
-            return self.unstable
         zero, key = problem.structure.zero, _key_of_fit(problem)
         if zero is None and key in self._fits:
             return self._fits[key]
