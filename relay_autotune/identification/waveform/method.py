@@ -287,6 +287,9 @@ def _is_stop(problem: Problem, begin: int, before: Fit, chosen: Choose) -> bool:
         whole = chosen(problem.thinned(_FEW), SIMPLE)
     except NoResponseError:
         return True
+    from_level = np.abs(problem.y[begin:] - np.median(problem.y[begin:]))
+    # On its way there it still moves.
+    begin += int(np.argmax(from_level <= _STILL_NOISE * roughness(problem.y)))
     away = np.arange(problem.y.size) >= begin
     # A load that comes just there is no process that goes on.
     return whole.problem.load is not None or _has_a_level_of_its_own(problem, before, whole, away)
