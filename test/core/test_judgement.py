@@ -414,10 +414,15 @@ def test_an_answer_between_few_samples_is_not_trusted(record, gains, tau, result
 
 
 @pytest.mark.nightly
-def test_gains_from_a_clipped_actuator_are_not_trusted():
+def test_gains_from_a_clipped_actuator_are_not_trusted_unless_its_end_is_known():
     assert analyse(clipped_steps(9.0), alone=True).verdict is Verdict.TRUSTED
-    assert analyse(clipped_steps(0.7), alone=True).verdict is not Verdict.TRUSTED
     assert analyse(clipped_steps(1.5), alone=True).verdict is not Verdict.TRUSTED
+    # Between this end and 0 there is one move: the end is told, and the process found beside it.
+    told = analyse(clipped_steps(0.7), alone=True).model
+    assert told is not None
+    assert told.ends[1] == pytest.approx(0.7, rel=0.02)
+    assert told.model.gain == pytest.approx(PROCESS.gain, rel=0.01)
+    assert any("below 0.69" in w and "ends" in w for w in told.warnings)
 
 
 @pytest.mark.nightly
