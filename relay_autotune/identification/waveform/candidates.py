@@ -523,7 +523,8 @@ class FitContext:
         zero, key = problem.structure.zero, _key_of_fit(problem)
         if zero is None and key in self._fits:
             return self._fits[key]
-        state = multistart(problem, self._starts(problem, self.guess), least)
+        sign = 0 if zero or problem.structure.unstable else self.sign
+        state = multistart(problem, self._starts(problem, self.guess), least, sign)
         if zero is not None:
             return self._with_zero_on_either_side(problem, state, least)
         if state is not None:

@@ -232,7 +232,7 @@ def coarse(problem: Problem) -> Problem:
 
 
 def multistart(
-    problem: Problem, thetas: Sequence[FloatArray], least: float = math.inf
+    problem: Problem, thetas: Sequence[FloatArray], least: float = math.inf, sign: int = 0
 ) -> Trial | None:
     """Return the best fit that any of some starts leads to; None where it is hopeless.
 
@@ -243,6 +243,7 @@ def multistart(
     :param thetas: starts.
     :param least: mean square of the best structure so far, in squares of the range: a fit that
         will not come near it is given up.
+    :param sign: of the gain, 1 or -1, which only fits have that come to no other; 0: any.
     """
     few = coarse(problem)
     bound = _HOPELESS * max(least, _CLEAN) * few.time.size
@@ -250,7 +251,8 @@ def multistart(
     starts: Sequence[FloatArray | Trial] = thetas
     for steps, count in _ROUNDS:
         reached = [refine(few, s, tolerance=_COARSE, most=steps) for s in starts[:count]]
-        starts = reached = _distinct(problem, reached)
+        reached = _distinct(problem, reached)
+        starts = reached = [s for s in reached if sign * s.coefficients[0] >= 0.0] or reached
         if not reached or min(predicted_cost(few, s) for s in reached) > bound:
             return None
     if reached[0].cost > bound:
