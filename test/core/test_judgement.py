@@ -235,6 +235,23 @@ def test_a_part_that_begins_at_rest_has_no_free_state(monkeypatch, at):
     assert [(p.time[0], p.relaxation) for p in parts[:2]] == [(b, False) for b in begins]
 
 
+def test_a_part_that_moves_freely_is_asked_for_no_models(monkeypatch):
+    """Those of an incubator that cooled after its pulses were of either direction."""
+    begins, drawn = [], posterior._allowed
+
+    def noted(problem, *args):
+        begins.append(problem.time[0])
+        return drawn(problem, *args)
+
+    monkeypatch.setattr(posterior, "_allowed", noted)
+    time = np.arange(0.0, 300.0, 0.5)
+    u = PiecewiseConstant(np.array([20.0, 30.0]), np.array([1.0, 0.0]), 0.0)
+    y = response(PROCESS, time, u) + np.random.default_rng(2).normal(0.0, 0.02, time.size)
+    in_parts(Record(time, y, u(time), held_input=u))
+    # The pulse, and the whole record.
+    assert begins[:2] == [0.0, 0.0]
+
+
 def test_each_half_of_a_record_tells_its_own_process():
     other = TransferFunction.fopdt(2.0, 10.0, 5.0)
     early, late = in_parts(joined(PROCESS, other)).parts

@@ -211,6 +211,9 @@ def _parts(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part, 
         second = replace(second, relaxation=bool(problem.structure.factors))
     parts = []
     for part in (first, second):
+        if part.relaxation and not changes_within(part.inputs[0], part.time).size:
+            # It moves freely, and a response of either direction fits what that leaves.
+            continue
         degrees = max(part.time.size - evaluate(part, state.theta).parameters, 1)
 
         def variance_of(left: FloatArray, degrees: int = degrees) -> float:
