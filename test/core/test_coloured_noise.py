@@ -562,3 +562,27 @@ def test_a_furnace_that_radiates_over_a_large_range_is_no_record_without_a_respo
     found = identify_waveform(Record(time=time, measurement=y, command=command))
     # From 11 K for each % of the command when cold to 5 when hot.
     assert 5.0 < found.model.gain < 15.0
+
+
+def test_a_colour_is_not_believed_against_a_much_closer_simulation_of_the_other_direction(
+    monkeypatch,
+):
+    """A cooler that was on before the record was trusted with the gain of a heater."""
+    time = 0.5 * np.arange(400)
+    command = 4.0 + 0.5 * np.exp(-time / 8.0)
+    u = PiecewiseConstant.from_samples(time, command)
+    y = response(TransferFunction.fopdt(-2.0, 12.0, 0.0), time, u) + 20.0 * np.exp(-time / 12.0)
+    y += 0.02 * np.random.default_rng(0).standard_normal(time.size)
+
+    def likelier_in_colour(context, *_):
+        (free,) = context.with_terms(context.fit(["fopdt"])[0], ("relaxation",))
+        assert free.model.process_sign == -1
+        heater = context.best_of_direction(1)[0]
+        colour = choice._colour_of_residual(heater.problem, heater.state)
+        assert colour is not None
+        return [context.refit_in_colour(heater, colour)]
+
+    monkeypatch.setattr(choice, "_compared", likelier_in_colour)
+    problem = problem_of([(time, y / 20.0, u)], FOPDT)
+    found = chosen_fit(problem, NOTHING, 0, 1.0, held=False)
+    assert found.state.coefficients[0] < 0.0

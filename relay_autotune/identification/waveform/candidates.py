@@ -156,6 +156,7 @@ class FitContext:
         not known.
     :param held: True: a relay held the process, so that it may integrate or grow.
     :param loads: True: a step of the load may be estimated.
+    :param closest: of all candidates in white noise, the one of each direction that leaves least.
     """
 
     problem: Problem
@@ -164,6 +165,7 @@ class FitContext:
     held: bool
     loads: bool
     _fits: dict[tuple[object, ...], Trial] = field(default_factory=dict, repr=False)
+    closest: dict[int, Candidate] = field(default_factory=dict, repr=False)
     _growing: dict[str, list[FloatArray]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -248,7 +250,12 @@ class FitContext:
         shortest, _ = time_scales(self.problem)
         if is_unobservable(model, shortest, self.length, self.pushed):
             return None
-        return Candidate(problem, state, model, self._score(problem, state, model))
+        found = Candidate(problem, state, model, self._score(problem, state, model))
+        if problem.colour is None:
+            pair = (self.closest.get(model.process_sign, found), found)
+            closer = min(pair, key=lambda c: c.state.cost / c.state.residual.size)
+            self.closest[model.process_sign] = closer
+        return found
 
     def _impossible(self, problem: Problem, state: Trial) -> list[str]:
         """Return the terms whose estimates are impossible, or too small to be a term.

@@ -183,6 +183,12 @@ def chosen_fit(
         for c, w in zip(own, white, strict=True)
         if w is None or w.model.process_sign == c.model.process_sign
     ]
+    # So does a much closer simulation, which may have other terms.
+    closest = min(few.closest.values(), key=mean_square_left, default=None)
+    if closest is not None and not (sign or slow):
+        direction, least = closest.model.process_sign, mean_square_left(closest)
+        own = [c for c in own if c.model.process_sign == direction or _simulates(c, least)]
+        simulated = simulated if own else [closest]
     fits: list[Fit] = []
     for group in (own, simulated):
         ranked = sorted(group, key=lambda c: c.score)
