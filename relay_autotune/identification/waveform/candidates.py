@@ -100,6 +100,8 @@ _FARTHEST = 10.0
 # (Thyagarajan and Yu 2003); a controller then holds it only at the edge of stability. With longer
 # ones, exp(-D s)/(1 - T s) is about the dead time D - T of any process.
 _HELD = math.log(2.0)
+# Least distance of the measurements at which a command rises and falls by the clock, in ranges.
+_APART = 0.5
 # Gain in a score that changes no choice.
 LITTLE = 0.5
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
@@ -634,8 +636,19 @@ def needs_no_past(problem: Problem, sign: int) -> bool:
 
 
 def _answers_soon(time: FloatArray, y: FloatArray, u: Input) -> bool:
-    """Return whether a measurement moves sooner after the first change than it had rested."""
-    rested = float(np.min(changes_within(u, time), initial=math.inf) - time[0])
+    """Return whether a measurement moves sooner after the first change than it had rested.
+
+    Where it is about alike when the command rises and when it falls, a relay or a controller
+    follows it, and changes the command because it left its rest, whatever moved it.
+    """
+    if not isinstance(u, PiecewiseConstant):
+        return False
+    inside = (u.times >= time[0]) & (u.times < time[-1])
+    then = y[np.maximum(time.searchsorted(u.times[inside]) - 1, 0)]
+    up = np.diff(u.levels)[inside] > 0.0
+    if up.all() or not up.any() or abs(then[up].mean() - then[~up].mean()) < _APART * np.ptp(y):
+        return False
+    rested = float(u.times[inside][0] - time[0])
     return min(latest_dead_time(time, y, u, sign) for sign in (-1, 1)) < rested
 
 
