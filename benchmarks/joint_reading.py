@@ -79,7 +79,7 @@ def of(names: Sequence[str], truth: float) -> Callable[[Topics], None]:
     """Return the reading of joints' velocities, of which the first has to be right."""
 
     def work(topics: Topics) -> None:
-        values = topics.signals(names)[names[0]].signal.values
+        values = topics.signals(names)[names[0]].values
         assert np.array_equal(values, truth + np.arange(values.size))
 
     return work
