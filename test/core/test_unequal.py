@@ -25,14 +25,17 @@ from relay_autotune.record.record import PiecewiseConstant, Record
 pytestmark = pytest.mark.long
 
 
-def _held(process, gains, setpoint, time, noise, seed):
-    """Return time, measurement and command of a process under its controller."""
+def _held(process, gains, setpoint, time, noise, seed, ends=(-np.inf, np.inf)):
+    """Return time, measurement and command of a process under its controller.
+
+    Its actuator follows commands between two ends.
+    """
     plant = VirtualProcess(process, disturbances=Disturbances(noise_std=noise), seed=seed)
     controller, rows = PidController(gains, 0.0), []
     for t in time:
         y = plant.measure(t)
         rows.append((t, y, controller.step(t, setpoint(t), y)))
-        plant.command(rows[-1][-1])
+        plant.command(float(np.clip(rows[-1][-1], *ends)))
     return np.array(rows).T
 
 
@@ -119,13 +122,15 @@ def test_a_staircase_over_a_gain_that_grows_is_no_integrator():
 def test_an_actuator_that_ends_is_found_in_what_its_controller_sent(ends):
     """Without the ends the model was trusted with half of the gain, and a true Ms of 3.5."""
     process = SOPDT.of_fields(gain=1.5, time_constants=[20.0, 5.0], dead_time=6.0)
-    plant = VirtualProcess(process, disturbances=Disturbances(noise_std=0.1), seed=3)
-    controller, rows = PidController(Controller(1.5, 25.0), 0.0), []
-    for t in np.arange(0.0, 450.0, 1.0):
-        y = plant.measure(t)
-        rows.append((t, y, controller.step(t, 0.0 if t < 20.0 else 10.0 if t < 150.0 else 0.0, y)))
-        plant.command(float(np.clip(rows[-1][-1], *ends)))
-    time, measured, sent = np.array(rows).T
+    time, measured, sent = _held(
+        process,
+        Controller(1.5, 25.0),
+        lambda t: 10.0 if 20.0 <= t < 150.0 else 0.0,
+        np.arange(0.0, 450.0, 1.0),
+        0.1,
+        3,
+        ends,
+    )
     found = identify(Record(time, measured, sent))
     assert found.model.gain == pytest.approx(process.gain, rel=0.02)
     assert found.ultimate_gain == pytest.approx(ultimate_point(process).gain, rel=0.05)
@@ -143,13 +148,15 @@ def test_an_actuator_that_ends_is_found_in_what_its_controller_sent(ends):
 def test_ends_are_found_where_the_controller_is_beyond_them_most_of_the_time():
     """They were not, and the gains were trusted with three times the ultimate gain."""
     process = SOPDT.of_fields(gain=2.5, time_constants=[34.0, 12.0], dead_time=7.3)
-    plant = VirtualProcess(process, disturbances=Disturbances(noise_std=0.1), seed=5)
-    controller, rows = PidController(Controller(0.89, 36.6), 0.0), []
-    for t in np.arange(0.0, 820.0, 1.7):
-        y = plant.measure(t)
-        rows.append((t, y, controller.step(t, 9.3 if 34.0 < t < 465.0 else 0.0, y)))
-        plant.command(float(np.clip(rows[-1][-1], -0.34, 4.22)))
-    time, measured, sent = np.array(rows).T
+    time, measured, sent = _held(
+        process,
+        Controller(0.89, 36.6),
+        lambda t: 9.3 if 34.0 < t < 465.0 else 0.0,
+        np.arange(0.0, 820.0, 1.7),
+        0.1,
+        5,
+        (-0.34, 4.22),
+    )
     assert np.mean((sent < -0.34) | (sent > 4.22)) > 0.6
     found = identify(Record(time, measured, sent))
     assert found.ends == pytest.approx((-0.34, 4.22), abs=0.1)

@@ -243,10 +243,7 @@ class _Posterior:
 
 
 def _posterior(
-    left: FloatArray,
-    nuisances: FloatArray,
-    moved: FloatArray,
-    priors: Sequence[FloatArray],
+    left: FloatArray, nuisances: FloatArray, moved: FloatArray, priors: Sequence[FloatArray]
 ) -> _Posterior:
     """Return the posterior of increments in the most likely colour of the noise.
 

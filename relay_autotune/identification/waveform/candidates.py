@@ -471,7 +471,7 @@ class FitContext:
                     state = self._best_fit(problem, least)
                 candidate = None if state is None else self.candidate(problem, state)
                 if candidate is not None:
-                    # What is none, such as a controller read backward, makes no other hopeless.
+                    # A controller read backward is no candidate and makes no other fit hopeless.
                     left = max(candidate.state.cost, self.floor)
                     least = min(least, left / problem.time.size)
                     found.append(candidate)

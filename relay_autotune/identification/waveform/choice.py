@@ -183,7 +183,7 @@ def chosen_fit(
         for c, w in zip(own, white, strict=True)
         if w is None or w.model.process_sign == c.model.process_sign
     ]
-    # So does a much closer simulation, which may have other terms.
+    # A much closer simulation shows the direction, too, whatever its terms.
     closest = min(few.closest.values(), key=mean_square_left, default=None)
     if closest is not None and not (sign or slow):
         direction, least = closest.model.process_sign, mean_square_left(closest)

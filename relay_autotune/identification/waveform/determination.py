@@ -128,7 +128,7 @@ def _for_fast(found: Identification, names: Sequence[str], tests: _Tests) -> lis
             f"most: the time between samples is {digits(tests.interval, 2)} s"
         )
     elif not tests.relay:
-        # Of the longest that they may be, nobody knows how much cancels.
+        # Of lags, dead time and zero that cancel, the longest possible one sets the time.
         half = 2.0 * max(longest, fast)
         if found.ultimate_frequency_std < found.ultimate_frequency:
             half = math.pi / found.ultimate_frequency
