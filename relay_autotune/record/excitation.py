@@ -28,6 +28,10 @@ from relay_autotune.record.record import (
     roughness,
 )
 
+# Earlier samples that a controller's law may hold: a PID's with a filter, and a sine and a ramp.
+PAST = 3
+# Share below which a direction of what a command is told from is one of rounding.
+_DEPENDENT = 1e-9
 # Least number of switches between two levels for a relay phase: two whole cycles.
 _FEWEST_SWITCHES = 4
 # A stay this many times the usual one ends a relay phase.
@@ -163,6 +167,31 @@ def changes_within(u: Input, time: FloatArray) -> FloatArray:
     :param time: of the samples [s], shape (n,).
     """
     return np.asarray(u.times[(u.times >= time[0]) & (u.times < time[-1])])
+
+
+def law_of(
+    u: FloatArray, y: FloatArray, used: NDArray[np.bool_] | slice = slice(None)
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the law that tells a command from its own past and the measurement.
+
+    ``u_k = sum_i a_i u_{k-i} + sum_j b_j y_{k-j} + c``, with i from 1 and j from 0 to ``PAST``, by
+    least squares. A controller's law is such a one, with a set-point in what it leaves.
+
+    :param u: the command, in any unit, shape (n,).
+    :param y: the measurement, in any unit, shape (n,).
+    :param used: which of the last n - PAST commands are told; default: all.
+    :return: a, b and c; what the law leaves of these commands; and what a law of the command's own
+        past leaves of them.
+    """
+    now = u[PAST:]
+    own = [u[PAST - k : u.size - k] for k in range(1, PAST + 1)]
+    seen = [y[PAST - k : y.size - k] for k in range(PAST + 1)]
+    left = []
+    for rows in (own, [*own, *seen]):
+        columns = np.stack((*rows, np.ones(now.size)), axis=1)[used]
+        factors = np.linalg.lstsq(columns, now[used], rcond=_DEPENDENT)[0]
+        left.append(now[used] - columns @ factors)
+    return factors, left[1], left[0]
 
 
 def only_move(u: PiecewiseConstant, time: FloatArray) -> float | None:

@@ -27,13 +27,14 @@ from relay_autotune.identification.waveform.problem import problem_of
 from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.separable import TRIAL, evaluate, refine
 from relay_autotune.identification.waveform.starts import (
-    latest_dead_time,
+    first_response,
+    is_controlled,
     multistart,
     start_fopdt,
     time_scales,
 )
 from relay_autotune.process.response import response
-from relay_autotune.process.structures import TABLE
+from relay_autotune.process.structures import TABLE, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
@@ -376,7 +377,67 @@ def test_neither_noise_nor_drift_counts_as_a_first_response(dead_time, tau, drif
     step = PiecewiseConstant(np.array([100.0]), np.ones(1), 0.0)
     y = response(TransferFunction.fopdt(1.0, tau, dead_time), time, step)
     y += drift * time + 0.02 * np.random.default_rng(seed).standard_normal(time.size)
-    assert latest_dead_time(time, y, step, 1) >= 2.0 * dead_time
+    assert first_response(time, y, step)[1] >= 2.0 * dead_time
+
+
+def rested_and_moved(process, edges, levels):
+    """Return a measurement that falls by 0.2 in 20 s, and answers the command."""
+    time = np.arange(0.0, 300.0)
+    command = PiecewiseConstant(np.array(edges), np.array(levels), 0.0)
+    noise = 0.01 * np.random.default_rng(2).standard_normal(time.size)
+    return time, response(process, time, command) - 0.01 * time + noise, command
+
+
+@pytest.mark.parametrize("gain", [-30.0, 30.0])
+def test_a_first_response_that_never_turns_rules_out_the_other_direction(gain):
+    process = TransferFunction.fopdt(gain, 30.0, 4.0)
+    for edges, levels in (([20.0], [1.0]), ([20.0, 21.0], [1.0, 0.0])):
+        below, above = first_response(*rested_and_moved(process, edges, levels))
+        ruled_out, latest = (below, above) if gain > 0.0 else (above, below)
+        assert ruled_out == -np.inf
+        assert 4.0 <= latest < 40.0
+
+
+def test_an_inverse_response_rules_out_no_direction():
+    process = structure_named("sopdt_zero").of_fields(
+        gain=30.0, time_constants=[10.0, 8.0], zeros=[-16.0], dead_time=2.0
+    )
+    below, above = first_response(*rested_and_moved(process, [20.0], [1.0]))
+    assert 2.0 <= below < np.inf
+    assert above > below
+
+
+def test_where_the_command_crosses_its_rest_a_later_response_tells_nothing():
+    process = TransferFunction.fopdt(30.0, 10.0, 4.0)
+    time, y, u = rested_and_moved(process, [20.0, 22.0, 30.0], [0.01, -1.0, 0.0])
+    assert first_response(time, y, u) == (np.inf, np.inf)
+
+
+def test_a_free_motion_does_not_stand_for_the_first_response():
+    """A heater pulsed for two minutes, which cools down by more modes than any structure has."""
+    rng = np.random.default_rng(0)
+    time, edges = np.arange(0.0, 4500.0, 3.0), 33.0 + np.cumsum(rng.uniform(6.0, 25.0, 9))
+    pulses = PiecewiseConstant(edges, np.tile([1.0, 0.0], 5)[:9] * (edges < edges[-1]), 0.0)
+    y = 25.0 + 0.01 * rng.standard_normal(time.size)
+    for share, lag in ((0.85, 540.0), (0.15, 150.0)):
+        heats = structure_named("sopdt").of_fields(
+            gain=100.0 * share, time_constants=[lag, 40.0], dead_time=3.0
+        )
+        y += response(heats, time, pulses) + 8.0 * share * np.exp(-time / lag)
+    assert identify_waveform(Record(time, y, pulses(time))).model.process_sign == 1
+
+
+def test_a_ramp_by_the_clock_is_no_controller():
+    """Only what a controller held may grow."""
+    rng = np.random.default_rng(1)
+    time = np.arange(400.0)
+    ramp = 50.0 - np.abs(time - 200.0) / 4.0 + 0.01 * rng.standard_normal(time.size)
+    by_the_clock = PiecewiseConstant.from_samples(time, ramp)
+    y = response(TransferFunction.fopdt(1.0, 20.0, 2.0), time, by_the_clock)
+    y += 0.5 * rng.standard_normal(time.size)
+    by_the_measurement = PiecewiseConstant.from_samples(time, ramp + 0.3 * (40.0 - y))
+    assert not is_controlled(time, y, by_the_clock)
+    assert is_controlled(time, y, by_the_measurement)
 
 
 @pytest.mark.nightly

@@ -13,6 +13,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.record.excitation import PAST, law_of
 from relay_autotune.record.record import Record
 
 _SURE = 4.5
@@ -22,9 +23,8 @@ _OTHER_AMPLITUDE = 1.2
 _LEAST_SAMPLES = 24
 # Relative difference up to which curves count as the same.
 _ALIKE = 1e-6
-# Earlier samples that a controller's law may hold, a PID's with a filter, and the last samples of
-# a record that are looked at.
-_PAST, _MOST_CHANGES = 3, 20_000
+# The last samples of a record that are looked at.
+_MOST_CHANGES = 20_000
 # Least number of means in a model's response, in which it then does not answer at once, and in the
 # record.
 _BLOCKS_OF_RESPONSE, _BLOCKS = 20.0, 100
@@ -90,30 +90,21 @@ def _read_backward(
     :param model: the model.
     """
     u, y = u - u.mean(), y - y.mean()
-    numbers = 2 * _PAST + 2
+    numbers = 2 * PAST + 2
     if u.size < _LEAST_SAMPLES or np.count_nonzero(np.diff(u)) <= numbers or not np.ptp(y) > 0.0:
         return None
     u_size, y_size = float(np.std(u)), float(np.std(y))
-    e = e[_PAST:] / y_size
+    e = e[PAST:] / y_size
     u, y = u / u_size, y / y_size
-    own = [u[_PAST - k : u.size - k] for k in range(1, _PAST + 1)]
-    seen = [y[_PAST - k : y.size - k] for k in range(_PAST + 1)]
-    now, constant = u[_PAST:], np.ones(e.size)
-
-    def left(rows: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        columns = np.stack((*rows, constant), axis=1)
-        factors = np.linalg.lstsq(columns, now, rcond=_ALIKE**1.5)[0]
-        return factors, now - columns @ factors
-
-    (_, alone), (factors, v) = left(own), left((*own, *seen))
+    now, (factors, v, alone) = u[PAST:], law_of(u, y)
     if not alone @ alone > _ALIKE * now.size:
         return None
-    if np.abs(np.roots(np.append(1.0, -factors[:_PAST]))).max() > _INTEGRATES:
+    if np.abs(np.roots(np.append(1.0, -factors[:PAST]))).max() > _INTEGRATES:
         return 0.0
     follows = 1.0 - float(v @ v) / float(alone @ alone)
     w = 2.0 * math.pi * np.fft.rfftfreq(e.size, interval)[1:]
-    delay = np.exp(-1j * w * interval) ** np.arange(_PAST + 1)[:, None]
-    answer, rest = factors[_PAST:-1] @ delay, 1.0 - factors[:_PAST] @ delay[1:]
+    delay = np.exp(-1j * w * interval) ** np.arange(PAST + 1)[:, None]
+    answer, rest = factors[PAST:-1] @ delay, 1.0 - factors[:PAST] @ delay[1:]
 
     def power(x: FloatArray) -> FloatArray:
         return np.asarray(np.abs(np.fft.rfft((x - x.mean()) * np.hanning(x.size))[1:]) ** 2)

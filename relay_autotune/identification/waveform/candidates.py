@@ -46,9 +46,9 @@ from relay_autotune.identification.waveform.starts import (
     Guess,
     best_of,
     coarse,
+    first_response,
     is_controlled,
     is_unobservable,
-    latest_dead_time,
     latest_dead_times,
     likeliest_ends,
     longest_push,
@@ -156,7 +156,9 @@ class FitContext:
     :param fopdt: the FOPDT that fits best.
     :param sign: the direction in which the relay worked, 1 or -1, which a model must share; 0:
         not known.
-    :param held: True: a relay held the process, so that it may integrate or grow.
+    :param held: True: a relay held the process.
+    :param bounded: True: a relay or a controller held the process, so that it may grow.
+    :param latest: as of :func:`latest_dead_times`.
     :param loads: True: a step of the load may be estimated.
     :param closest: of all candidates in white noise, the one of each direction that leaves least.
     """
@@ -165,6 +167,8 @@ class FitContext:
     fopdt: Trial
     sign: int
     held: bool
+    bounded: bool
+    latest: tuple[float, float]
     loads: bool
     _fits: dict[tuple[object, ...], Trial] = field(default_factory=dict, repr=False)
     closest: dict[int, Candidate] = field(default_factory=dict, repr=False)
@@ -174,15 +178,22 @@ class FitContext:
         self._fits[_key_of_fit(self.problem)] = self.fopdt
 
     @classmethod
-    def of(cls, problem: Problem, sign: int, *, held: bool) -> FitContext:
-        """Return the context of a record's samples.
+    def of(cls, problem: Problem, sign: int, *, held: bool, most: int = 0) -> FitContext:
+        """Return the context of a record's samples, or of some of them.
 
-        :param problem: samples and input, with a FOPDT structure.
+        :param problem: all samples and their input, with a FOPDT structure.
         :param sign: the direction in which the relay worked; 0: not known.
         :param held: True: a relay held the process.
+        :param most: number of samples that structures are fitted to; 0: all.
         """
-        fopdt = best_of(problem, start_fopdt(problem, sign))
-        return cls(problem, fopdt, sign, held, loads=held)
+        bounded = held or all(
+            is_controlled(problem.time[part], problem.y[part], u)
+            for part, u in zip(problem.experiments, problem.inputs, strict=True)
+        )
+        latest = latest_dead_times(problem, sign)
+        few = problem.thinned(most) if most else problem
+        fopdt = best_of(few, start_fopdt(few, sign))
+        return cls(few, fopdt, sign, held, bounded, latest, loads=held)
 
     @cached_property
     def guess(self) -> Guess:
@@ -198,16 +209,6 @@ class FitContext:
     def length(self) -> float:
         """Length of the record [s]."""
         return float(np.ptp(self.problem.time))
-
-    @cached_property
-    def latest(self) -> tuple[float, float]:
-        """Longest dead time of a gain below zero, and of one above [s]."""
-        return latest_dead_times(self.problem, self.sign)
-
-    @cached_property
-    def bounded(self) -> bool:
-        """True if a relay or a controller held the process, so that it may grow by itself."""
-        return self.held or all(is_controlled(time, u) for time, u in self._parts)
 
     @cached_property
     def most_growth(self) -> float:
@@ -238,13 +239,16 @@ class FitContext:
         model = problem.structure.model_at(state.theta, state.coefficients)
         if model is None:
             return None
-        if self.sign * model.process_sign < 0:
-            # A relay of the wrong direction oscillates on the first answer of an inverse response.
+        below, above = self.latest
+        own, other = (above, below) if model.process_sign > 0 else (below, above)
+        if own < 0.0:
+            # What is first seen, and what a relay oscillates on, is that of an inverse response.
             if not any(-_LASTING * self.length < z.real < 0.0 for z in model.zeros):
                 return None
-        elif model.dead_time > (latest := self.latest[model.process_sign > 0]):
+            own = other
+        if model.dead_time > own:
             # The measurement had moved by then, whatever else a fit would explain so.
-            return self.refit(replace(problem, latest=latest), state)
+            return self.refit(replace(problem, latest=own), state)
         if model.growth_in(1.0) > self.most_growth or model.growth_in(model.dead_time) > _HELD:
             return None
         if self._impossible(problem, state):
@@ -649,7 +653,7 @@ def _answers_soon(time: FloatArray, y: FloatArray, u: Input) -> bool:
     if up.all() or not up.any() or abs(then[up].mean() - then[~up].mean()) < _APART * np.ptp(y):
         return False
     rested = float(u.times[inside][0] - time[0])
-    return min(latest_dead_time(time, y, u, sign) for sign in (-1, 1)) < rested
+    return any(0.0 <= latest < rested for latest in first_response(time, y, u))
 
 
 def moves_seldom(problem: Problem) -> bool:

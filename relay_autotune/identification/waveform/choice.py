@@ -338,16 +338,15 @@ def _best_in_any_colour(
 
 def _context_of_few_samples(problem: Problem, sign: int, held: bool) -> FitContext:
     """Return the context of evenly spaced samples, a few for each response of the process."""
-    few = FitContext.of(problem.thinned(_FEW), sign, held=held)
+    few = FitContext.of(problem, sign, held=held, most=_FEW)
     if few.problem.time.size == problem.time.size:
         return few
     log_tau, dead_time = few.fopdt.theta
     responses = float(np.ptp(problem.time)) / (math.exp(log_tau) + dead_time)
     count = int(min(max(_A_RESPONSE * responses, _FEW), _MOST))
-    more = problem.thinned(count)
-    if more.time.size == few.problem.time.size:
+    if problem.thinned(count).time.size == few.problem.time.size:
         return few
-    return FitContext.of(more, sign, held=held)
+    return FitContext.of(problem, sign, held=held, most=count)
 
 
 def _compared(
@@ -362,7 +361,7 @@ def _compared(
     first = [*SIMPLE, *[INTEGRATOR_LAG.name] * bool(context.problem.motions)]
     if known.structure:
         names = first = [known.structure]
-    simple = context.fit(first, known.order)
+    simple = context.fit(first, known.order) or context.fit(names, known.order)
     if before is not None:
         again = context.refit(with_terms_of(before.problem, context.problem), before.state)
         simple += [] if again is None else [again]
@@ -610,7 +609,8 @@ def _fitted_to_all(
             # Samples so dense are correlated: those that were compared are not.
             own = candidate.problem
             state = refine(own, candidate.state.theta)
-    if own.structure.model_at(state.theta, state.coefficients) is None:
+    model = own.structure.model_at(state.theta, state.coefficients)
+    if model is None or model.process_sign != candidate.model.process_sign:
         return None
     others = (c for c in found if c is not candidate)
     return Fit(own, state, (candidate, *others), scale)

@@ -61,7 +61,7 @@ from relay_autotune.identification.waveform.separable import (
     information_criterion,
     refine,
 )
-from relay_autotune.identification.waveform.starts import is_controlled
+from relay_autotune.identification.waveform.starts import moves_always
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, TABLE
 from relay_autotune.record.cycles import runs_of
@@ -223,7 +223,7 @@ def _best_fit(problem: Problem, known: Known, sign: int, scale: float, *, held: 
 
 def _moves_often(time: FloatArray, u: Input) -> bool:
     """Return whether a command moves many times, and not as a controller's does."""
-    return changes_within(u, time).size >= MANY and not is_controlled(time, u)
+    return changes_within(u, time).size >= MANY and not moves_always(time, u)
 
 
 def _without_stops(problem: Problem, chosen: Choose) -> tuple[Problem, str]:
