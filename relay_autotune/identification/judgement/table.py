@@ -260,8 +260,7 @@ MODEL_CHECKS = (
         doubtful=0.6,
         sentence="commands on one side of {detail} lose {value} of the effect that those on the "
         "other side have",
-        remedy="keep the command where the actuator is not at its end, and give its ends as "
-        "limits of the command",
+        remedy="keep the command where the actuator is not at its end, or record what it gets",
         measure=_clipped,
     ),
 )

@@ -215,8 +215,8 @@ def _best_fit(problem: Problem, known: Known, sign: int, scale: float, *, held: 
     if not held and (ahead := ahead_of_command(fit.problem, fit.state)):
         raise IdentificationError(
             f"the measurement moves {digits(ahead, 2)} s before the recorded command, which is "
-            "recorded late and hides the dead time: record it when it is sent, on the clock of "
-            "the measurement"
+            "recorded late and hides the dead time, or is not the one that acts: record it when "
+            "it is sent, on the clock of the measurement, and as the actuator gets it"
         )
     return replace(fit, warnings=(*fit.warnings, *filter(None, (dropped, stopped))))
 
@@ -355,8 +355,8 @@ def _without_dropouts(problem: Problem, chosen: Callable[[Problem], Fit]) -> tup
         if not _has_a_level_of_its_own(problem, rest, whole, away):
             return problem, ""
     warning = (
-        f"{int(away.sum())} of the samples, the first at {problem.time[np.argmax(away)]:.4g} s, "
-        "lie beyond a jump that no process makes, and were left out: check the sensor for dropouts"
+        f"left out: {counted(int(away.sum()), 'sample')} beyond a jump that no process makes, "
+        f"the first at {problem.time[np.argmax(away)]:.4g} s; check the sensor for dropouts"
     )
     # Smaller jumps stand out once the largest are left out.
     there, more = _without_dropouts(there, chosen)
@@ -435,8 +435,8 @@ def _without_spikes(problem: Problem, fit: Fit, known: Known, chosen: Choose) ->
     # Spikes hide differences: a structure that was hopeless with them is hopeless without.
     again = chosen(rest.part(~outlying), names_not_hopeless(fit), fit)
     warning = (
-        f"{int(np.sum(outlying))} of the samples lie more than {_OUTLIER:g} standard deviations "
-        "off every model and were left out: check the sensor for spikes"
+        f"left out: {counted(int(np.sum(outlying)), 'sample')} more than {_OUTLIER:g} standard "
+        "deviations off every model; check the sensor for spikes"
     )
     return replace(again, warnings=(*fit.warnings, warning))
 
