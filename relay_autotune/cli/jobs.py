@@ -42,7 +42,7 @@ from relay_autotune.identification.methods import ONLY_JOINT
 from relay_autotune.loop.gains import FORMS, Controller, Gains
 from relay_autotune.loop.laws import LAWS
 from relay_autotune.quantities import Quantity, declared
-from relay_autotune.record.excitation import resting_command
+from relay_autotune.record.moves import resting_command
 from relay_autotune.record.record import Record
 from relay_autotune.recordings import read_experiments
 from relay_autotune.result import Analysis

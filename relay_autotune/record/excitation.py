@@ -21,17 +21,12 @@ from relay_autotune.record.cycles import (
     two_level_runs,
 )
 from relay_autotune.record.record import (
-    Input,
     PiecewiseConstant,
     Record,
     cached_on_record,
     roughness,
 )
 
-# Earlier samples that a controller's law may hold: a PID's with a filter, and a sine and a ramp.
-PAST = 3
-# Share below which a direction of what a command is told from is one of rounding.
-_DEPENDENT = 1e-9
 # Least number of switches between two levels for a relay phase: two whole cycles.
 _FEWEST_SWITCHES = 4
 # A stay this many times the usual one ends a relay phase.
@@ -72,16 +67,8 @@ _SHARE = 0.05
 # A controller's command, which follows the noise and creeps at rest, moves far beyond this share.
 _FAR = 0.5
 
-# Least number of samples of a rest that shows the past; the largest share of its range by which
-# the measurement moves during it, and by which it would, going on like that, in the whole record.
-_ENOUGH_REST = 15
-_STILL, _STILL_LATER = 0.05, 0.5
-
 # Least number of samples that show what a model lacks.
 LEAST_SAMPLES = 60
-
-# Number of time constants within which an unstable process leaves any rest.
-MOST_GROWTH = 7.0
 
 
 @dataclass(frozen=True)
@@ -158,105 +145,6 @@ def gaps_of(record: Record) -> Gaps:
     seldom = float(np.mean(changes)) < _CONTINUOUS
     hidden = before[changes[before - 1] & seldom]
     return Gaps(before, float(np.max(interval[long], initial=0.0)), hidden)
-
-
-def changes_within(u: Input, time: FloatArray) -> FloatArray:
-    """Return when an input changes between the first and the last sample [s].
-
-    :param u: the input.
-    :param time: of the samples [s], shape (n,).
-    """
-    return np.asarray(u.times[(u.times >= time[0]) & (u.times < time[-1])])
-
-
-def law_of(
-    u: FloatArray, y: FloatArray, used: NDArray[np.bool_] | slice = slice(None)
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the law that tells a command from its own past and the measurement.
-
-    ``u_k = sum_i a_i u_{k-i} + sum_j b_j y_{k-j} + c``, with i from 1 and j from 0 to ``PAST``, by
-    least squares. A controller's law is such a one, with a set-point in what it leaves.
-
-    :param u: the command, in any unit, shape (n,).
-    :param y: the measurement, in any unit, shape (n,).
-    :param used: which of the last n - PAST commands are told; default: all.
-    :return: a, b and c; what the law leaves of these commands; and what a law of the command's own
-        past leaves of them.
-    """
-    now = u[PAST:]
-    own = [u[PAST - k : u.size - k] for k in range(1, PAST + 1)]
-    seen = [y[PAST - k : y.size - k] for k in range(PAST + 1)]
-    left = []
-    for rows in (own, [*own, *seen]):
-        columns = np.stack((*rows, np.ones(now.size)), axis=1)[used]
-        factors = np.linalg.lstsq(columns, now[used], rcond=_DEPENDENT)[0]
-        left.append(now[used] - columns @ factors)
-    return factors, left[1], left[0]
-
-
-def only_move(u: PiecewiseConstant, time: FloatArray) -> float | None:
-    """Return when an input changes, if it does so once between the first and the last sample [s].
-
-    :param u: the input.
-    :param time: of the samples [s], shape (n,).
-    """
-    changes = changes_within(u, time)
-    moves = changes[np.diff(u.levels)[np.isin(u.times, changes)] != 0.0]
-    return float(moves[0]) if moves.size == 1 else None
-
-
-def longest_stay(time: FloatArray, u: Input) -> float:
-    """Return the longest time between samples for which an input stood still [s].
-
-    :param time: of the samples [s], shape (n,).
-    :param u: the input.
-    """
-    changes = changes_within(u, time)
-    return float(np.max(np.diff(np.concatenate((time[:1], changes, time[-1:])))))
-
-
-def answering_time(time: FloatArray, u: Input) -> float:
-    """Return how long samples go on after the first change of an input within them [s].
-
-    :param time: of the samples [s], shape (n,).
-    :param u: the input; where it does not change, the time of all samples counts.
-    """
-    changes = changes_within(u, time)
-    return float(time[-1] - (changes[0] if changes.size else time[0]))
-
-
-def begins_at_rest(time: FloatArray, y: FloatArray, u: Input) -> bool:
-    """Return whether an experiment begins with a rest, which shows what came before.
-
-    :param time: of the samples [s], shape (n,).
-    :param y: the measurement, shape (n,).
-    :param u: the input.
-    """
-    changes = changes_within(u, time)
-    before = time < (changes[0] if changes.size else time[0])
-    if np.count_nonzero(before) < _ENOUGH_REST or not np.ptp(time[before]) > 0.0:
-        return False
-    t, wide = time[before] - float(np.mean(time[before])), float(np.ptp(y))
-    slope = float(t @ y[before]) / float(t @ t)
-    left = y[before] - np.mean(y[before]) - slope * t
-    chance = 2.0 * math.sqrt(float(left @ left) / left.size / float(t @ t))
-    if abs(slope) * float(np.ptp(t)) > _STILL * wide:
-        return False
-    return abs(slope) <= chance or abs(slope) * float(np.ptp(time)) <= _STILL_LATER * wide
-
-
-@cached_on_record
-def resting_command(record: Record) -> float:
-    """Return the command at which a process rests before its test [u]; NaN: it does not.
-
-    :param record: a record of any origin.
-    """
-    if record.settings is not None:
-        return record.settings.baseline
-    u = record.input()
-    if not begins_at_rest(record.time, record.measurement, u):
-        return math.nan
-    return float(u(record.time[:1])[0])
 
 
 def _unbroken(record: Record) -> list[tuple[int, int]]:

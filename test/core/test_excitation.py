@@ -15,12 +15,8 @@ from sampled_relay import simulate_sampled_relay
 from relay_autotune.analysis import analyse
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.excitation import (
-    LEAST_SAMPLES,
-    find_experiments,
-    gaps_of,
-    resting_command,
-)
+from relay_autotune.record.excitation import LEAST_SAMPLES, find_experiments, gaps_of
+from relay_autotune.record.moves import resting_command
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
 MODEL = TransferFunction.fopdt(1.65, 20.0, 10.0)

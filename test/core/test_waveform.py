@@ -26,17 +26,12 @@ from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.identification.waveform.problem import problem_of
 from relay_autotune.identification.waveform.residuals import ljung_box
 from relay_autotune.identification.waveform.separable import TRIAL, evaluate, refine
-from relay_autotune.identification.waveform.starts import (
-    first_response,
-    is_controlled,
-    multistart,
-    start_fopdt,
-    time_scales,
-)
+from relay_autotune.identification.waveform.starts import multistart, start_fopdt, time_scales
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import TABLE, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
+from relay_autotune.record.moves import first_response, is_controlled
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 from relay_autotune.verdict import Verdict
 
@@ -438,6 +433,18 @@ def test_a_ramp_by_the_clock_is_no_controller():
     by_the_measurement = PiecewiseConstant.from_samples(time, ramp + 0.3 * (40.0 - y))
     assert not is_controlled(time, y, by_the_clock)
     assert is_controlled(time, y, by_the_measurement)
+
+
+def test_a_command_of_straight_lines_is_no_controller():
+    time = np.arange(600.0)
+    dense = np.arange(0.0, 600.0, 0.05)
+    command, drive = (np.sin(0.03 * t) + np.sin(0.11 * t) for t in (time, dense))
+    held = PiecewiseConstant.from_samples(dense, drive)
+    y = response(TransferFunction.fopdt(2.0, 20.0, 4.0), time, held)
+    y += 0.02 * np.random.default_rng(1).standard_normal(time.size)
+    record = Record(time, y, command, continuous_command=True)
+    assert not is_controlled(time, y, record.drive())
+    assert identify_waveform(record).model.gain == pytest.approx(2.0, rel=0.02)
 
 
 @pytest.mark.nightly

@@ -13,7 +13,7 @@ import numpy as np
 from relay_autotune.arrays import FloatArray
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.excitation import PAST, law_of
+from relay_autotune.record.moves import PAST, law_of
 from relay_autotune.record.record import Record
 
 _SURE = 4.5

@@ -41,7 +41,8 @@ from relay_autotune.identification.waveform.residuals import (
 from relay_autotune.identification.waveform.separable import residual_of
 from relay_autotune.process.model_set import ModelErrors
 from relay_autotune.process.response import response
-from relay_autotune.record.excitation import LEAST_SAMPLES, only_move
+from relay_autotune.record.excitation import LEAST_SAMPLES
+from relay_autotune.record.moves import only_move
 from relay_autotune.record.record import PiecewiseConstant, Record
 
 _BINS = 48

@@ -13,7 +13,7 @@ import numpy as np
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.identification.judgement.difference import Difference
 from relay_autotune.identification.result import Identification
-from relay_autotune.record.excitation import changes_within, longest_stay
+from relay_autotune.record.moves import changes_within, longest_stay
 from relay_autotune.record.record import Record
 
 

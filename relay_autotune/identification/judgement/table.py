@@ -20,7 +20,8 @@ from relay_autotune.identification.judgement.checks import read_backward
 from relay_autotune.identification.judgement.evidence import Evidence
 from relay_autotune.process.response import response
 from relay_autotune.record.cycles import limit_cycle
-from relay_autotune.record.excitation import LEAST_SAMPLES, MOST_GROWTH
+from relay_autotune.record.excitation import LEAST_SAMPLES
+from relay_autotune.record.moves import MOST_GROWTH
 from relay_autotune.text import digits
 from relay_autotune.verdict import Check, Measured, not_known
 

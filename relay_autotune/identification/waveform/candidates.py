@@ -46,12 +46,9 @@ from relay_autotune.identification.waveform.starts import (
     Guess,
     best_of,
     coarse,
-    first_response,
-    is_controlled,
     is_unobservable,
     latest_dead_times,
     likeliest_ends,
-    longest_push,
     multistart,
     shifted_columns,
     start_fopdt,
@@ -71,10 +68,13 @@ from relay_autotune.process.structures import (
     Structure,
 )
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.excitation import (
+from relay_autotune.record.moves import (
     MOST_GROWTH,
+    answers_soon,
     begins_at_rest,
     changes_within,
+    is_controlled,
+    longest_push,
     longest_stay,
 )
 from relay_autotune.record.record import Input, PiecewiseConstant
@@ -100,8 +100,6 @@ _FARTHEST = 10.0
 # (Thyagarajan and Yu 2003); a controller then holds it only at the edge of stability. With longer
 # ones, exp(-D s)/(1 - T s) is about the dead time D - T of any process.
 _HELD = math.log(2.0)
-# Least distance of the measurements at which a command rises and falls by the clock, in ranges.
-_APART = 0.5
 # Gain in a score that changes no choice.
 LITTLE = 0.5
 # Longest time that a record shows, in its lengths: a longer lag acts as an integrator, and the
@@ -629,7 +627,7 @@ def needs_no_past(problem: Problem, sign: int) -> bool:
     ]
     return (
         not sign
-        and (moves_seldom(problem) or all(_answers_soon(*part) for part in parts))
+        and (moves_seldom(problem) or all(answers_soon(*part) for part in parts))
         and all(
             # A command that is known to have held until the first sample is such a rest, too.
             (isinstance(u, PiecewiseConstant) and u.times[0] == time[0])
@@ -637,23 +635,6 @@ def needs_no_past(problem: Problem, sign: int) -> bool:
             for time, y, u in parts
         )
     )
-
-
-def _answers_soon(time: FloatArray, y: FloatArray, u: Input) -> bool:
-    """Return whether a measurement moves sooner after the first change than it had rested.
-
-    Where it is about alike when the command rises and when it falls, a relay or a controller
-    follows it, and changes the command because it left its rest, whatever moved it.
-    """
-    if not isinstance(u, PiecewiseConstant):
-        return False
-    inside = (u.times >= time[0]) & (u.times < time[-1])
-    then = y[np.maximum(time.searchsorted(u.times[inside]) - 1, 0)]
-    up = np.diff(u.levels)[inside] > 0.0
-    if up.all() or not up.any() or abs(then[up].mean() - then[~up].mean()) < _APART * np.ptp(y):
-        return False
-    rested = float(u.times[inside][0] - time[0])
-    return any(0.0 <= latest < rested for latest in first_response(time, y, u))
 
 
 def moves_seldom(problem: Problem) -> bool:

@@ -53,7 +53,6 @@ from relay_autotune.identification.waveform.separable import (
     refine,
     rms_in_simulation,
 )
-from relay_autotune.identification.waveform.starts import large_changes
 from relay_autotune.process.structures import (
     FOPDT,
     INTEGRATOR_INVERSE,
@@ -69,7 +68,7 @@ from relay_autotune.process.structures import (
     UNSTABLE_FOPDT,
     UNSTABLE_SOPDT,
 )
-from relay_autotune.record.excitation import answering_time
+from relay_autotune.record.moves import answering_time, large_changes
 from relay_autotune.record.record import PiecewiseConstant
 from relay_autotune.text import digits
 

@@ -45,7 +45,7 @@ from relay_autotune.identification.waveform.separable import (
 )
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.record.excitation import only_move
+from relay_autotune.record.moves import only_move
 from relay_autotune.record.record import Record
 
 _UNEXPLAINED = 1.5

@@ -61,17 +61,11 @@ from relay_autotune.identification.waveform.separable import (
     information_criterion,
     refine,
 )
-from relay_autotune.identification.waveform.starts import moves_always
 from relay_autotune.process.response import response
 from relay_autotune.process.structures import FOPDT, TABLE
 from relay_autotune.record.cycles import runs_of
-from relay_autotune.record.excitation import (
-    MOST_AWAY,
-    at_its_ends,
-    changes_within,
-    jumped_away,
-    smooth,
-)
+from relay_autotune.record.excitation import MOST_AWAY, at_its_ends, jumped_away, smooth
+from relay_autotune.record.moves import changes_within, moves_always
 from relay_autotune.record.record import Input, PiecewiseConstant, Record, roughness
 from relay_autotune.text import counted, digits
 

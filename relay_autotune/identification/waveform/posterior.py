@@ -38,7 +38,7 @@ from relay_autotune.identification.waveform.separable import (
 )
 from relay_autotune.process.structures import Structure
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.excitation import changes_within
+from relay_autotune.record.moves import changes_within
 from relay_autotune.record.record import PiecewiseConstant
 
 # Samples at which draws are compared with the fit, and those of both parts together.

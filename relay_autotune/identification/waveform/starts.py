@@ -38,19 +38,19 @@ from relay_autotune.process.response import response
 from relay_autotune.process.structures import Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.record.excitation import PAST, answering_time, changes_within, law_of
+from relay_autotune.record.moves import (
+    answering_time,
+    changes_within,
+    first_response,
+    large_changes,
+    moves_always,
+)
 from relay_autotune.record.record import Input, PiecewiseConstant
 
 # Least number of samples in each period of an oscillation of the process.
 _SAMPLES_A_SWING = 4.0
 # Shortest response of a process, in intervals between samples.
 _SHORTEST_RESPONSE = 0.5
-# A response is seen where the measurement leaves the line of a rest by this many times the range
-# about it and its drift, and by this share of the whole range; least number of samples of a rest.
-# Of 300,000 rests in white noise 4 showed a response in it, of as many random walks 3 %.
-_RANGES, _DRIFTS, _SHARE, _RESTING = 3.0, 2.0, 0.03, 10
-# Longest dead time that is believed, over the time of the first response.
-_BELIEVED = 2.0
 
 
 def is_unobservable(
@@ -83,68 +83,6 @@ def is_unobservable(
     )
 
 
-def longest_push(time: FloatArray, u: Input) -> float:
-    """Return the longest time for which a command stayed on one side of its mean [s].
-
-    :param time: of the samples [s], shape (n,).
-    :param u: the command.
-    :return: infinite for ramps, whose response turns gradually.
-    """
-    if not isinstance(u, PiecewiseConstant):
-        return math.inf
-    level = u(time)
-    turns = np.flatnonzero(np.diff(level > level.mean())) + 1
-    return float(np.diff(time[np.concatenate(([0], turns, [time.size - 1]))]).max())
-
-
-def first_response(time: FloatArray, y: FloatArray, u: Input) -> tuple[float, float]:
-    """Return the longest dead time that the first response after a rest allows, of each direction.
-
-    A response is sure where the measurement leaves the line of the rest before the first change of
-    the command much farther than it moved during the rest, within no longer than the rest lasted,
-    so that neither noise nor a drift explains it. Twice the time of that response is allowed,
-    since a process may change its dead time a little meanwhile. A response in the other direction
-    is an inverse one, for which a dead time may stand.
-
-    :param time: of the samples [s], shape (n,).
-    :param y: the measurement, in any unit, shape (n,).
-    :param u: the command.
-    :return: of a gain below zero, and of one above [s]: infinite where no response is sure, minus
-        infinity where a sure one goes in the other direction alone.
-    """
-    unknown = math.inf, math.inf
-    inside = np.flatnonzero((u.times >= time[0]) & (u.times < time[-1]))
-    if not inside.size or not isinstance(u, PiecewiseConstant):
-        return unknown
-    k = int(inside[0])
-    change = float(u.times[k])
-    rested = change - float(time[0])
-    moved = np.sign(u.levels[k + 1 :] - u.levels[k])
-    first = int(np.searchsorted(time, change, side="right"))
-    if first < _RESTING:
-        return unknown
-    line = np.polynomial.Polynomial.fit(time[:first], y[:first], 1)
-    left = moved[0] * (y - line(time))
-    drift, noise = float(np.ptp(line(time[:first]))), float(np.ptp(left[:first]))
-    band = max(_RANGES * noise, _DRIFTS * drift, _SHARE * float(np.ptp(y)))
-    # What comes after the command has crossed its rest may answer that.
-    crossed = u.times[k:][moved == -moved[0]]
-    last = int(np.searchsorted(time, crossed[0], side="right")) if crossed.size else time.size
-    begins, answers = [], []
-    for sign in (-1, 1):
-        outside = sign * left[first:last] > band
-        # A single sample may be a spike.
-        at = time[first + np.flatnonzero(outside[:-1] & outside[1:])]
-        begins.append(float(at[0]) - change if at.size else math.inf)
-        # After the command came back, only the former answer and drifts go on.
-        answers.append(bool(np.any(u(at) != u.levels[k])))
-    latest = [_BELIEVED * begin if begin <= rested else math.inf for begin in begins]
-    for one, other in ((0, 1), (1, 0)):
-        if latest[one] < math.inf and begins[one] < begins[other] and not answers[other]:
-            latest[other] = -math.inf
-    return latest[0], latest[1]
-
-
 _GRID_SAMPLES = 240
 _BEST = 3
 _COARSE = 1e-4
@@ -159,12 +97,6 @@ _SLOWER = (2.0, 6.0, 20.0)
 _RINGING, _SWINGS = 0.05, 3
 # Dampings at the start; shares of the dead time that fast lags have, and what a zero leaves of it.
 _DAMPINGS, _SHARES_OF_FAST, _HIDDEN = (1.35, 0.9, 0.4), (0.3, 0.7, 3.0), 0.3
-# Largest share of the samples at which a relay switches. Where a command changes more often, only
-# changes by at least this share of its range count.
-_MOST_SWITCHES = 0.5
-_SWITCH = 0.25
-# Jumps of a command are those beyond four standard deviations, six medians, of its usual moves.
-_A_JUMP = 6.0
 # Largest distance, in unit steps, of two fits that count as one; and the ratio of two fits' sums
 # of squares up to which all samples decide between them.
 _SAME = 0.02
@@ -183,45 +115,6 @@ _SHARES = (
 _OFF_GRID = 0.1
 # Second lags of a process that grows by itself, relative to the time constant of its growth.
 _RATIOS = (0.1, 0.3, 1.0, 3.0)
-
-
-def moves_always(time: FloatArray, u: Input) -> bool:
-    """Return whether a command moves at most samples, as a controller's does.
-
-    :param time: of the samples [s], shape (n,).
-    :param u: the command.
-    """
-    return changes_within(u, time).size > _MOST_SWITCHES * time.size
-
-
-def is_controlled(time: FloatArray, y: FloatArray, u: Input) -> bool:
-    """Return whether a command moves at most samples, and as the measurement says.
-
-    The command's next move is predicted by its past alone, and by that of the measurement, too
-    (Granger 1969; Gustavsson, Ljung and Soderstrom 1977), beside the jumps that a set-point makes.
-
-    :param time: of the samples [s], shape (n,).
-    :param y: the measurement, in any unit, shape (n,).
-    :param u: the command.
-    """
-    if not moves_always(time, u) or time.size <= 4 * PAST:
-        return False
-    u_seen, y = u(time) / np.ptp(u.values), y / (np.ptp(y) or 1.0)
-    jumps = np.abs(law_of(u_seen, y)[2])
-    _, left, alone = law_of(u_seen, y, jumps <= _A_JUMP * np.median(jumps))
-    by_both, by_its_past = (
-        information_criterion(float(e @ e), e.size, numbers, e.size * NEGLIGIBLE**2)
-        for e, numbers in ((left, 2 * PAST + 2), (alone, PAST + 1))
-    )
-    return by_both < by_its_past
-
-
-def large_changes(u: PiecewiseConstant) -> FloatArray:
-    """Return when a command moves far, as a controller's does when its set-point is switched [s].
-
-    :param u: the command.
-    """
-    return np.asarray(u.times[np.abs(np.diff(u.levels)) >= _SWITCH * float(np.ptp(u.values))])
 
 
 def time_scales(problem: Problem) -> tuple[float, float]:
