@@ -175,14 +175,10 @@ def chosen_fit(
     # A disturbance that no term describes can make a colour that explains the response as well.
     # The best simulation still shows the response and its direction: it is the second choice.
     slow = problem.colour is not None
-    white = [c if slow or c.problem.colour is None else few.refit_in_colour(c, None) for c in own]
-    simulated = [w for c, w in zip(own, white, strict=True) if w is not None and w is not c]
-    own = [
-        c
-        for c, w in zip(own, white, strict=True)
-        if w is None or w.model.process_sign == c.model.process_sign
-    ]
-    # A much closer simulation shows the direction, too, whatever its terms.
+    coloured = [c for c in own if not slow and c.problem.colour is not None]
+    again = (few.refit_in_colour(c, None) for c in coloured)
+    simulated = [c for c in again if c is not None]
+    # A much closer one shows the direction, too, whatever its terms.
     closest = min(few.closest.values(), key=mean_square_left, default=None)
     if closest is not None and not (sign or slow):
         direction, least = closest.model.process_sign, mean_square_left(closest)
