@@ -422,6 +422,18 @@ def test_a_free_motion_does_not_stand_for_the_first_response():
     assert identify_waveform(Record(time, y, pulses(time))).model.process_sign == 1
 
 
+def test_a_step_just_before_the_record_is_found_where_no_model_shows_a_response_without_it():
+    time = np.linspace(0.0, 1020.0, 1500)
+    heater = structure_named("sopdt").of_fields(
+        gain=0.6, time_constants=[510.0, 25.5], dead_time=153.0
+    )
+    y = 20.0 + response(heater, time, PiecewiseConstant(np.array([0.0, 510.0]), [50.0, 0.0], 0.0))
+    y += 0.02 * np.random.default_rng(5).standard_normal(time.size)
+    model = identify_waveform(Record(time, y, np.where(time < 510.0, 50.0, 0.0))).model
+    assert model.gain == pytest.approx(0.6, rel=0.2)
+    assert model.dead_time == pytest.approx(153.0, rel=0.2)
+
+
 def test_a_ramp_by_the_clock_is_no_controller():
     """Only what a controller held may grow."""
     rng = np.random.default_rng(1)

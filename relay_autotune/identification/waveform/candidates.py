@@ -87,8 +87,9 @@ _SAMPLES_EACH = 8
 MANY = 6
 # Gains have to hold on the models of these, too.
 PLAIN = (FOPDT.name, SOPDT.name)
-# Those for which a dead time or a lag can stand.
-_HIDDEN = frozenset(("drift", "relaxation", "past", "ends"))
+# What was before the record, and with the ends that for which a dead time or a lag can stand.
+_BEFORE = frozenset(("drift", "relaxation", "past"))
+_HIDDEN = _BEFORE | {"ends"}
 # Steps of a fit with a further term or in another colour, and how often a load and ends are moved.
 _STEPS, _MOVES = 15, 4
 # Dead time on either side of a zero at 0, as a share of all times together.
@@ -307,6 +308,16 @@ class FitContext:
             # The free rate of an integrator is what a free state is to a lag: one imitation.
             imitations -= problem.drift and model.integrators > 0
         return score + IMITATES_A_DRIFT * imitations
+
+    def of_one_term(self) -> list[Candidate]:
+        """Return the FOPDT with drift, free state or past, for where it needs one of them."""
+        found = []
+        for terms in self.terms:
+            if _BEFORE.issuperset(terms):
+                changed: dict[str, Any] = dict.fromkeys(terms, True)
+                problem = replace(self.problem, **changed)
+                found.append(self.candidate(problem, self._fopdt_of(problem)))
+        return [c for c in found if c is not None]
 
     def with_one_more_term(self, candidate: Candidate) -> list[Candidate]:
         """Return a candidate with each further term beside the model that a record may need.

@@ -356,7 +356,10 @@ def _compared(
     first = [*SIMPLE, *[INTEGRATOR_LAG.name] * bool(context.problem.motions)]
     if known.structure:
         names = first = [known.structure]
-    simple = context.fit(first, known.order) or context.fit(names, known.order)
+    simple = context.fit(first, known.order)
+    if FOPDT.name in first and all(c.structure != FOPDT for c in simple):
+        # Without what came before, it may have no response, or go in a direction ruled out.
+        simple = [*simple, *context.of_one_term()] or context.fit(names, known.order)
     if before is not None:
         again = context.refit(with_terms_of(before.problem, context.problem), before.state)
         simple += [] if again is None else [again]
