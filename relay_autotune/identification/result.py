@@ -221,6 +221,8 @@ class Identification:
     ends: tuple[float, float] = (-math.inf, math.inf)
     # True: the process was not at rest at the relay's baseline when the test began.
     began_away: bool = False
+    # True: a move of the command just before the record was estimated with the model.
+    moved_before: bool = False
     # True: a step of the load was estimated with the model.
     loaded: bool = False
     # Play between command and process that was estimated with the model [u]; 0: none.

@@ -57,6 +57,7 @@ UNTOLD = {
             "play",
             "friction",
             "began_away",
+            "moved_before",
             "loaded",
             "to_explain",
             "parts",

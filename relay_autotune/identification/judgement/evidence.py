@@ -58,7 +58,7 @@ class Evidence:
         if len(fitted) == len(time) and np.isfinite(fitted).any():
             time = time[np.isfinite(fitted)]
         changes = changes_within(self.record.input(), self.record.time)
-        begin = np.min(changes, initial=time[-1])
+        begin = time[0] if self.found.moved_before else np.min(changes, initial=time[-1])
         return float(time[-1] - max(begin, time[0]))
 
     @property

@@ -120,6 +120,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         middle=middle_of(problem.inputs[0]) if problem.unequal else math.nan,
         ends=problem.ends_of(state.coefficients),
         began_away=_began_away(records, fit),
+        moved_before=problem.past,
         loaded=problem.load is not None,
         play=problem.play_of(state.coefficients),
         friction=problem.dry_friction(state.coefficients),
