@@ -41,6 +41,10 @@ _REST = 10.0
 _CONTINUOUS = 0.2
 _FEWEST_VALUES = 20
 
+# A command of several levels rests where it moves by less than this share of its range in the
+# whole recording, as one that is measured does.
+_JITTER = 0.01
+
 # A break in the record: no sample for this time, and for a multiple of the usual interval.
 _BREAK_S = 60.0
 _BREAK_INTERVALS = 1000.0
@@ -252,7 +256,8 @@ def _in_part(record: Record, first: int, last: int) -> list[Stretch]:
     if times.size and not often and times[-1] == record.time[last]:
         # A change at the last sample, as when all is switched off, has no response behind it.
         times, values, last = times[:-1], values[:-1], last - 1
-    if times.size == 0:
+    jitters = np.unique(values).size > 2 and np.ptp(values) < _JITTER * np.ptp(record.command)
+    if times.size == 0 or jitters:
         return []
     noise = roughness(record.measurement[first : last + 1])
     if often and np.unique(values).size >= _FEWEST_VALUES:

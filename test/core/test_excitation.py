@@ -186,6 +186,15 @@ def test_a_change_of_the_command_in_a_gap_of_a_table_ends_an_experiment():
     assert not find_experiments(without(hit, 40.0, 52.0))
 
 
+def test_the_jitter_of_a_measured_command_is_no_experiment():
+    time = np.concatenate((np.arange(0.0, 1000.0, 0.25), np.arange(5000.0, 6000.0, 0.25)))
+    jitter = np.random.default_rng(1).integers(-2, 3, 100)
+    for size, parts in ((0.1, 1), (1.0, 2)):
+        levels = [0.0, 100.0, *(100.0 + size * jitter)]
+        moves = [500.0, *np.linspace(5200.0, 5800.0, jitter.size)]
+        assert len(spans(commanded(moves, levels, time=time))) == parts
+
+
 def test_rows_that_were_written_when_something_changed_have_no_gaps():
     whole = commanded([50.0, 150.0], [0.0, 1.0, 0.0], noise=0.0)
     changed = np.abs(np.diff(np.round(whole.measurement, 2), prepend=-1.0)) > 0.0
