@@ -121,12 +121,11 @@ def begins_at_rest(time: FloatArray, y: FloatArray, u: Input) -> bool:
     before = time < (changes[0] if changes.size else time[0])
     if np.count_nonzero(before) < _RESTING or not np.ptp(time[before]) > 0.0:
         return False
-    t, wide = time[before] - float(np.mean(time[before])), float(np.ptp(y))
-    slope = float(t @ y[before]) / float(t @ t)
-    left = y[before] - np.mean(y[before]) - slope * t
-    chance = 2.0 * math.sqrt(float(left @ left) / left.size / float(t @ t))
-    if abs(slope) * float(np.ptp(t)) > _STILL * wide:
+    slope, left = _line_of(time[before], y[before])
+    wide, spread = float(np.ptp(y)), math.sqrt(left.size) * float(np.std(time[before]))
+    if abs(slope) * float(np.ptp(time[before])) > _STILL * wide:
         return False
+    chance = 2.0 * float(np.std(left)) / spread
     return abs(slope) <= chance or abs(slope) * float(np.ptp(time)) <= _STILL_LATER * wide
 
 
@@ -170,10 +169,10 @@ def first_response(time: FloatArray, y: FloatArray, u: Input) -> tuple[float, fl
     first = int(np.searchsorted(time, change, side="right"))
     if first < _RESTING:
         return unknown
-    line = np.polynomial.Polynomial.fit(time[:first], y[:first], 1)
-    left = moved[0] * (y - line(time))
-    drift, noise = float(np.ptp(line(time[:first]))), float(np.ptp(left[:first]))
-    band = max(_RANGES * noise, _DRIFTS * drift, _SHARE * float(np.ptp(y)))
+    slope, noise = _line_of(time[:first], y[:first])
+    left = moved[0] * (y - np.mean(y[:first]) - slope * (time - np.mean(time[:first])))
+    drift = abs(slope) * float(np.ptp(time[:first]))
+    band = max(_RANGES * float(np.ptp(noise)), _DRIFTS * drift, _SHARE * float(np.ptp(y)))
     # What comes after the command has crossed its rest may answer that.
     crossed = u.times[k:][moved == -moved[0]]
     last = int(np.searchsorted(time, crossed[0], side="right")) if crossed.size else time.size
@@ -187,9 +186,17 @@ def first_response(time: FloatArray, y: FloatArray, u: Input) -> tuple[float, fl
         answers.append(bool(np.any(u(at) != u.levels[k])))
     latest = [_BELIEVED * begin if begin <= rested else math.inf for begin in begins]
     for one, other in ((0, 1), (1, 0)):
+        # The direction is sure where the measurement never turns to the other side.
         if latest[one] < math.inf and begins[one] < begins[other] and not answers[other]:
             latest[other] = -math.inf
     return latest[0], latest[1]
+
+
+def _line_of(time: FloatArray, y: FloatArray) -> tuple[float, FloatArray]:
+    """Return the slope of the line through some samples, 0 at one instant, and what it leaves."""
+    t, away = time - np.mean(time), y - np.mean(y)
+    slope = float(t @ away) / (float(t @ t) or 1.0)
+    return slope, away - slope * t
 
 
 def answers_soon(time: FloatArray, y: FloatArray, u: Input) -> bool:

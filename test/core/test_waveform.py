@@ -402,6 +402,14 @@ def test_an_inverse_response_rules_out_no_direction():
     assert above > below
 
 
+def test_a_rest_of_rows_that_share_one_stamp_tells_no_direction(recwarn):
+    time = np.concatenate((np.zeros(20), np.arange(1.0, 50.0)))
+    command = PiecewiseConstant(np.array([0.5]), np.ones(1), 0.0)
+    y = response(TransferFunction.fopdt(1.0, 5.0, 2.0), time, command)
+    assert first_response(time, y, command) == (np.inf, np.inf)
+    assert not recwarn.list
+
+
 def test_where_the_command_crosses_its_rest_a_later_response_tells_nothing():
     process = TransferFunction.fopdt(30.0, 10.0, 4.0)
     time, y, u = rested_and_moved(process, [20.0, 22.0, 30.0], [0.01, -1.0, 0.0])
