@@ -261,7 +261,8 @@ MODEL_CHECKS = (
         doubtful=0.6,
         sentence="commands on one side of {detail} lose {value} of the effect that those on the "
         "other side have",
-        remedy="keep the command where the actuator is not at its end, or record what it gets",
+        remedy="keep the command within limits at which the actuator is not at its end, or record "
+        "what the actuator gets",
         measure=_clipped,
     ),
 )
