@@ -256,14 +256,16 @@ def _in_part(record: Record, first: int, last: int) -> list[Stretch]:
     if times.size and not often and times[-1] == record.time[last]:
         # A change at the last sample, as when all is switched off, has no response behind it.
         times, values, last = times[:-1], values[:-1], last - 1
-    jitters = np.unique(values).size > 2 and np.ptp(values) < _JITTER * np.ptp(record.command)
-    if times.size == 0 or jitters:
+    if times.size == 0:
+        return []
+    before = held.levels[int(np.argmax(inside))]
+    levels = np.unique(np.append(values, before))
+    if levels.size > 3 and np.ptp(levels) < _JITTER * np.ptp(record.command):
         return []
     noise = roughness(record.measurement[first : last + 1])
     if often and np.unique(values).size >= _FEWEST_VALUES:
         return _with_rest(record, first, last, noise, _moving(record, first, last, noise))
     noise = min(noise, _noise_between(record, first, last, times))
-    before = held.levels[int(np.argmax(inside))]
     changes = PiecewiseConstant(times, values, before)
     return _with_rest(record, first, last, noise, _switching_parts(record, last, changes, noise))
 

@@ -193,6 +193,10 @@ def test_the_jitter_of_a_measured_command_is_no_experiment():
         levels = [0.0, 100.0, *(100.0 + size * jitter)]
         moves = [500.0, *np.linspace(5200.0, 5800.0, jitter.size)]
         assert len(spans(commanded(moves, levels, time=time))) == parts
+    # A step after which it jitters is one.
+    levels = [0.0, 100.0, *(100.0 + 0.1 * jitter)]
+    (whole,) = spans(commanded([500.0, *np.linspace(520.0, 900.0, 100)], levels, time=TIME))
+    assert whole[1] < 500.0
 
 
 def test_rows_that_were_written_when_something_changed_have_no_gaps():
