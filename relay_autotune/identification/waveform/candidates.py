@@ -191,8 +191,15 @@ class FitContext:
         )
         latest = latest_dead_times(problem, sign)
         few = problem.thinned(most) if most else problem
-        fopdt = best_of(few, start_fopdt(few, sign))
-        return cls(few, fopdt, sign, held, bounded, latest, loads=held)
+        return cls(few, _first_fopdt(few, sign), sign, held, bounded, latest, loads=held)
+
+    def with_samples(self, problem: Problem) -> FitContext:
+        """Return the context with other samples of the same record, of which nothing is fitted.
+
+        :param problem: the samples, with a FOPDT structure.
+        """
+        fopdt = _first_fopdt(problem, self.sign)
+        return replace(self, problem=problem, fopdt=fopdt, _fits={}, closest={}, _growing={})
 
     @cached_property
     def guess(self) -> Guess:
@@ -509,7 +516,7 @@ class FitContext:
         :param sign: of the gain, 1 or -1.
         """
         problem = replace(without(self.problem, ["friction"]), structure=FOPDT, colour=None)
-        fopdt = best_of(problem, start_fopdt(problem, sign))
+        fopdt = _first_fopdt(problem, sign)
         found = replace(self, problem=problem, fopdt=fopdt, _fits={}).fit(PLAIN)
         return [c for c in found if c.model.process_sign == sign]
 
@@ -576,6 +583,11 @@ class FitContext:
         nearer = min((evaluate(problem, theta) for theta in starts), key=lambda s: s.cost)
         again = refine(problem, nearer, tolerance=TRIAL)
         return again if state is None else min(state, again, key=lambda s: s.cost)
+
+
+def _first_fopdt(problem: Problem, sign: int) -> Trial:
+    """Return the best fit of a FOPDT, from which a context begins."""
+    return best_of(problem, start_fopdt(problem, sign))
 
 
 def _key_of_fit(problem: Problem) -> tuple[object, ...]:

@@ -339,9 +339,8 @@ def _context_of_few_samples(problem: Problem, sign: int, held: bool) -> FitConte
     log_tau, dead_time = few.fopdt.theta
     responses = float(np.ptp(problem.time)) / (math.exp(log_tau) + dead_time)
     count = int(min(max(_A_RESPONSE * responses, _FEW), _MOST))
-    if problem.thinned(count).time.size == few.problem.time.size:
-        return few
-    return FitContext.of(problem, sign, held=held, most=count)
+    more = problem.thinned(count)
+    return few if more.time.size == few.problem.time.size else few.with_samples(more)
 
 
 def _compared(
@@ -608,6 +607,7 @@ def _fitted_to_all(
             own = candidate.problem
             state = refine(own, candidate.state.theta)
     model = own.structure.model_at(state.theta, state.coefficients)
+    # Other samples may lead the fit to a minimum that is not the candidate's.
     if model is None or model.process_sign != candidate.model.process_sign:
         return None
     others = (c for c in found if c is not candidate)
