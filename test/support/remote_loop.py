@@ -169,9 +169,9 @@ class Loop:
 
         def at_rest() -> tuple[int, Any] | None:
             status, result = self.ask_for_proof(during, request)
-            # How soon the loop runs and has settled depends on the load of the machine; what is
-            # left of a swing counts as noise.
-            early = result.why.code in (Code.NOT_AT_REST, Code.FEW_SAMPLES)
+            # How soon the loop is heard, runs and has settled depends on the load of the machine;
+            # what is left of a swing counts as noise.
+            early = result.why.code in (Code.NOT_HEARD, Code.NOT_AT_REST, Code.FEW_SAMPLES)
             return None if early or "cannot be judged" in result.reason else (status, result)
 
         return self.rig.until(at_rest, "a loop at rest")
