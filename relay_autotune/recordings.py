@@ -206,9 +206,10 @@ def _taken_apart(record: Record, *, whole: bool) -> tuple[list[Record], list[str
     :param whole: whether it is one experiment, whatever it looks like.
     :raises BagError: if nothing stands out of the noise.
     """
-    from relay_autotune.record.excitation import find_experiments, gaps_of
+    from relay_autotune.record.excitation import find_experiments, frozen, gaps_of
 
     missing = _missing_rows(record)
+    missing += [_stay(record, *stay) for stay in frozen(record.measurement)]
     if whole or len(record) < _FEWEST_SAMPLES:
         return [record], missing
     stretches = find_experiments(record)
@@ -237,6 +238,16 @@ def _taken_apart(record: Record, *, whole: bool) -> tuple[list[Record], list[str
             zip(begins, ends, stretches, strict=True), start=1
         )
     ]
+
+
+def _stay(record: Record, begin: int, stop: int) -> str:
+    """Return a note about samples that repeat one value."""
+    return (
+        f"the measurement stands still from {record.time[begin]:g} s to "
+        f"{record.time[stop - 1]:g} s: {stop - begin} samples are all "
+        f"{record.measurement[begin]:g}, and those before hardly ever repeat a value: a frozen "
+        "sensor or log, or the end of the sensor's range"
+    )
 
 
 def _missing_rows(record: Record) -> list[str]:

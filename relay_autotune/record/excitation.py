@@ -59,6 +59,10 @@ _REGULAR = 1.5
 _SATURATED = 20
 _AWAY, _CROSSED = 0.04, 0.2
 _MOST_FOR_SPEED = 2000
+# Samples before a stay that tell whether the sensor repeats values, and the share of equal ones
+# above which it does: 20 equal ones are chance in one of 10^11 stays of a sensor just below it.
+_BEFORE_STAY = 60
+_REPEATS = 0.25
 # Ratio of a sensor's jumps to the largest of all smaller moves from sample to sample, and the
 # largest share of the samples in which it is away: of data as they come 1 to 10 % are gross errors
 # (Hampel, Ronchetti, Rousseeuw and Stahel 1986).
@@ -97,7 +101,7 @@ def find_experiments(record: Record) -> tuple[Stretch, ...]:
     A stretch includes the rest before and after it, which shows the operating point and the noise.
     Each rest is at most as long as the experiment itself, or ten times as long for steps and
     pulses.
-    A saturated measurement, a break, or a change of the command in a gap ends an experiment.
+    A saturated or frozen measurement, a break, or a change of the command in a gap ends an experiment.
 
     :param record: a record of any origin.
     :returns: the stretches; empty if the command does not move the measurement.
@@ -152,7 +156,7 @@ def gaps_of(record: Record) -> Gaps:
 
 
 def _unbroken(record: Record) -> list[tuple[int, int]]:
-    """Return first and last sample of each part without a break or a saturated measurement."""
+    """Return first and last sample of each part without a break or a stuck measurement."""
     time, y = record.time, record.measurement
     interval = np.diff(time)
     if interval.size == 0:
@@ -161,6 +165,8 @@ def _unbroken(record: Record) -> list[tuple[int, int]]:
     broken = interval > max(_BREAK_S, _BREAK_INTERVALS * usual)
     broken[gaps_of(record).hidden - 1] = True
     kept = ~_saturated(y)
+    for begin, stop in frozen(y):
+        kept[begin + 1 : stop] = False
     apart = ~kept[1:] | ~kept[:-1] | broken
     begins = np.flatnonzero(kept & np.concatenate(([True], apart)))
     ends = np.flatnonzero(kept & np.concatenate((apart, [True])))
@@ -199,6 +205,26 @@ def at_its_ends(y: FloatArray, band: float = 0.0) -> list[tuple[int, int, float]
         for begin, stop, end in sorted(runs)
         if np.any(np.abs(y[max(begin - 2 * few * step, 0) : begin] - end) > away)
     ]
+
+
+def frozen(y: FloatArray) -> list[tuple[int, int]]:
+    """Return where a measurement repeats a value, since its sensor or its log stood still.
+
+    A sensor that hardly ever repeats a value repeats one for long that it gives at no other time.
+    A process at rest in a sensor without noise comes back to the values of other rests, or slows
+    down, so that the sensor repeats values before.
+
+    :param y: the measurement [y], shape (n,).
+    :return: of each stay the first sample, and the one after the last.
+    """
+    same = np.diff(y) == 0.0
+    found = []
+    for begin, last in runs_of(same):
+        before = same[max(begin - _BEFORE_STAY, 0) : max(begin - 1, 0)]
+        long = last + 1 - begin >= _SATURATED and before.size >= _SATURATED
+        if long and np.mean(before) < _REPEATS and np.sum(y == y[begin]) == last + 1 - begin:
+            found.append((begin, last + 1))
+    return found
 
 
 def jumped_away(y: FloatArray) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from sampled_relay import simulate_sampled_relay
 from relay_autotune.analysis import analyse
 from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.excitation import LEAST_SAMPLES, find_experiments, gaps_of
+from relay_autotune.record.excitation import LEAST_SAMPLES, find_experiments, frozen, gaps_of
 from relay_autotune.record.moves import resting_command
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 
@@ -219,6 +219,24 @@ def test_a_saturated_stretch_is_left_out():
     for _, begin, end in spans(clipped):
         inside = (record.time >= begin) & (record.time <= end)
         assert np.count_nonzero(clipped.measurement[inside] == 51.2) < 20
+
+
+@pytest.mark.parametrize("resolution", [0.001, 0.01])
+def test_an_experiment_ends_where_the_sensor_freezes(resolution):
+    record = controlled(lambda t: 50.0 + 10.0 * (t > 200.0) - 5.0 * (t > 1000.0))
+    y = np.round(record.measurement / resolution) * resolution
+    assert frozen(y) == []
+    at = int(np.searchsorted(record.time, 230.0))
+    y[at:] = y[at] + 0.3 * resolution
+    assert frozen(y) == [(at, y.size)]
+    (found,) = find_experiments(replace(record, measurement=y))
+    assert found.last == at
+
+
+def test_a_process_that_rests_in_a_sensor_without_noise_is_not_frozen():
+    record = commanded([500.0, 1500.0, 1600.0], [0, 1, 0.1, 1], noise=0.0)
+    for digits in (0, 1, 2, 4, 12):
+        assert frozen(np.round(record.measurement, digits)) == []
 
 
 @pytest.mark.parametrize("tau", [0.1, 0.5])
