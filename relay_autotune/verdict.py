@@ -47,18 +47,21 @@ class Measured:
     :param value: in the check's unit; NaN: not known, which is doubtful.
     :param detail: further text for the sentence, such as names; it replaces ``{detail}``. Of a
         value that is not known: why.
+    :param remedy: what to do; empty: what the check says.
     """
 
     value: float
     detail: str = ""
+    remedy: str = ""
 
 
-def not_known(why: str) -> Measured:
+def not_known(why: str, remedy: str = "") -> Measured:
     """Return the measurement of a check that applies, but cannot be made: that is no pass.
 
     :param why: what is missing, as the end of a sentence.
+    :param remedy: what to do; empty: what the check says.
     """
-    return Measured(math.nan, why)
+    return Measured(math.nan, why, remedy)
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,7 @@ class Check:
             return found
         if math.isnan(value):
             said = f"{self.title} could not be checked: {measured.detail}"
-            return replace(found, sentence=said, remedy=self.remedy)
+            return replace(found, sentence=said, remedy=measured.remedy or self.remedy)
         number = f"{value:g}" if math.isinf(value) else digits(value, 3)
         said = self.sentence.format(value=number, limit=digits(limit, 3), detail=measured.detail)
         return replace(found, sentence=said, remedy=self.remedy)

@@ -101,7 +101,7 @@ def find_experiments(record: Record) -> tuple[Stretch, ...]:
     A stretch includes the rest before and after it, which shows the operating point and the noise.
     Each rest is at most as long as the experiment itself, or ten times as long for steps and
     pulses.
-    A saturated or frozen measurement, a break, or a change of the command in a gap ends an experiment.
+    A saturated or frozen measurement, a break, or a change of the command in a gap ends one.
 
     :param record: a record of any origin.
     :returns: the stretches; empty if the command does not move the measurement.

@@ -35,6 +35,9 @@ _BELIEVED = 2.0
 MOST_GROWTH = 7.0
 # Earlier samples that a controller's law may hold: a PID's with a filter, and a sine and a ramp.
 PAST = 3
+# Largest difference of a command from one sine, over its variance. A triangle's is 0.11, that of a
+# sine which is held sixteen times in each period 0.055.
+_NO_SINE = 0.06
 # Share below which a direction of what a command is told from is one of rounding.
 _DEPENDENT = 1e-9
 
@@ -98,6 +101,33 @@ def longest_push(time: FloatArray, u: Input) -> float:
     level = u(time)
     turns = np.flatnonzero(np.diff(level > level.mean())) + 1
     return float(np.diff(time[np.concatenate(([0], turns, [time.size - 1]))]).max())
+
+
+def left_by_one_sine(time: FloatArray, y: FloatArray, u: Input) -> float:
+    """Return what a constant, a line and the steady answer to one sine leave of a measurement [y].
+
+    Such an answer tells two numbers of a process, however long it lasts. At a sixth of its period
+    apart, a sine fulfils ``u(t + h) + u(t - h) = u(t)``, and no other periodic command does; of
+    ``u(t)`` and ``u(t - h)`` any answer to it is a sum.
+
+    :param time: of the samples [s], shape (n,).
+    :param y: the measurement, shape (n,).
+    :param u: the command.
+    :return: rms; NaN where the command is not two whole periods of one sine.
+    """
+    h = longest_push(time, u) / 3.0
+    if not 12.0 * h <= time[-1] - time[0]:
+        return math.nan
+    inside = (time >= time[0] + h) & (time <= time[-1] - h)
+    t = time[inside]
+    level = u(t)
+    middle = np.mean(level)
+    apart = u(t + h) + u(t - h) - level - middle
+    if float(np.mean(apart**2)) > _NO_SINE * float(np.var(level)):
+        return math.nan
+    columns = np.stack((np.ones(t.size), t - t[0], level - middle, u(t - h) - middle), axis=1)
+    left = y[inside] - columns @ np.linalg.lstsq(columns, y[inside], rcond=None)[0]
+    return math.sqrt(float(np.mean(left**2)))
 
 
 def answering_time(time: FloatArray, u: Input) -> float:

@@ -148,6 +148,23 @@ def test_few_samples_are_no_evidence_for_gains(record, gains):
     assert "could not be checked: 50 samples show too little" in risk.sentence
 
 
+@pytest.mark.parametrize("seed", [0, 2])
+def test_the_steady_answer_to_one_sine_is_no_evidence_for_gains(seed):
+    """Two numbers are known of a lag of four orders; it was trusted, with the wrong sign."""
+    process = TransferFunction(2.0, time_constants=(1.0, 0.7, 0.5, 0.3), dead_time=0.05)
+    time = np.arange(0.0, 30.0, 0.02)
+    for before, known in ((40.0, False), (0.0, True)):
+        all_time = np.arange(-before, 30.0, 0.02)
+        u = PiecewiseConstant(all_time, np.sin(2.0 * (all_time + before)), 0.0)
+        noise = np.random.default_rng(seed).normal(0.0, 0.01, time.size)
+        y = response(process, time, u) + noise
+        found = analyse(Record(time=time, measurement=y, command=u(time)))
+        risk = next(f for f in found.judgement.findings if f.name == "risk")
+        assert math.isnan(risk.value) != known
+        assert risk.remedy.startswith("record steps") != known
+        assert (found.verdict is Verdict.TRUSTED) == known
+
+
 @pytest.mark.parametrize(("slower", "result"), [(1.0, Result.PASSED), (60.0, Result.DOUBTFUL)])
 def test_gains_far_slower_than_the_process_are_told(record, gains, slower, result):
     late = replace(gains, ti=slower * gains.ti)

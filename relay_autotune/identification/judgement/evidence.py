@@ -13,7 +13,7 @@ import numpy as np
 from relay_autotune.arrays import ComplexArray, FloatArray
 from relay_autotune.identification.judgement.difference import Difference
 from relay_autotune.identification.result import Identification
-from relay_autotune.record.moves import changes_within, longest_stay
+from relay_autotune.record.moves import changes_within, left_by_one_sine, longest_stay
 from relay_autotune.record.record import Record
 
 
@@ -60,6 +60,11 @@ class Evidence:
         changes = changes_within(self.record.input(), self.record.time)
         begin = time[0] if self.found.moved_before else np.min(changes, initial=time[-1])
         return float(time[-1] - max(begin, time[0]))
+
+    @property
+    def left_by_one_sine(self) -> float:
+        """What the steady answer to a command of one sine leaves [y]; NaN: there is no such."""
+        return left_by_one_sine(self.record.time, self.record.measurement, self.record.input())
 
     @property
     def growth(self) -> float:
