@@ -14,7 +14,6 @@ under a controller at 100 Hz. No file is edited. Exit status 1 if gains are not 
 from __future__ import annotations
 
 import argparse
-import re
 import statistics
 import sys
 import tempfile
@@ -29,6 +28,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test" / "support")
 from loop_rig import Rig
 from robot_rig import Robot
 from ros_domain import free_domain
+
+from relay_autotune import analyse, read_records
 
 # Of the simulated wheels, in closed form: w D + atan(w T) = pi.
 TRUE_ULTIMATE_GAIN = 3.13
@@ -45,11 +46,13 @@ def run(words: tuple[str, ...]) -> tuple[float, float] | None:
             done = robot.tune(*words)
             status = done.wait(300.0)
             seconds = time.monotonic() - begun
-            found = re.search(r"K_u ([0-9.]+) u/y, w_u", done.log)
-            if status != 0 or found is None:
+            if status != 0:
                 print(done.log, file=sys.stderr)
                 return None
-            return seconds, float(found[1]) / TRUE_ULTIMATE_GAIN - 1.0
+            (tuned,) = (rig.folder / ".ros" / "relay_autotune").glob("*/")
+            (record,) = read_records(tuned)
+            model = analyse(record).model
+            return seconds, model.ultimate_gain / TRUE_ULTIMATE_GAIN - 1.0
         finally:
             rig.close()
 
