@@ -153,7 +153,7 @@ def own(counts: Iterable[int], deadline: float) -> Iterator[Kill]:
         loop = HandLoop(rig, kc=0.3, ti=1.0)
         loop.apply(0.5, 0.6, "proven")
         result = loop.verify(setpoint_step=0.3)
-        assert result.passed, result.reason
+        assert result.verdict == result.PASSED, result.reason
         course = Course(rig, loop.step)
         for count in counts:
             if time.monotonic() > deadline:
