@@ -59,10 +59,9 @@ _REGULAR = 1.5
 _SATURATED = 20
 _AWAY, _CROSSED = 0.04, 0.2
 _MOST_FOR_SPEED = 2000
-# Samples before a stay that tell whether the sensor repeats values, and the share of equal ones
-# above which it does: 20 equal ones are chance in one of 10^11 stays of a sensor just below it.
-_BEFORE_STAY = 60
-_REPEATS = 0.25
+# Share of a sensor's other samples that equal the one before, below which it hardly ever repeats a
+# value: 20 equal ones are chance once in 10^24 samples.
+_REPEATS = 0.05
 # Ratio of a sensor's jumps to the largest of all smaller moves from sample to sample, and the
 # largest share of the samples in which it is away: of data as they come 1 to 10 % are gross errors
 # (Hampel, Ronchetti, Rousseeuw and Stahel 1986).
@@ -211,18 +210,18 @@ def frozen(y: FloatArray) -> list[tuple[int, int]]:
     """Return where a measurement repeats a value, since its sensor or its log stood still.
 
     A sensor that hardly ever repeats a value repeats one for long that it gives at no other time.
-    A process at rest in a sensor without noise comes back to the values of other rests, or slows
-    down, so that the sensor repeats values before.
+    A rest before the first move is none, and a position that rests often repeats values often.
 
     :param y: the measurement [y], shape (n,).
     :return: of each stay the first sample, and the one after the last.
     """
     same = np.diff(y) == 0.0
-    found = []
+    repeats, found = int(np.count_nonzero(same)), []
     for begin, last in runs_of(same):
-        before = same[max(begin - _BEFORE_STAY, 0) : max(begin - 1, 0)]
-        long = last + 1 - begin >= _SATURATED and before.size >= _SATURATED
-        if long and np.mean(before) < _REPEATS and np.sum(y == y[begin]) == last + 1 - begin:
+        long = last - begin
+        rarely = repeats - long < _REPEATS * (same.size - long)
+        late = begin >= LEAST_SAMPLES and long >= _SATURATED
+        if late and rarely and np.sum(y == y[begin]) == long + 1:
             found.append((begin, last + 1))
     return found
 

@@ -221,7 +221,7 @@ def test_a_saturated_stretch_is_left_out():
         assert np.count_nonzero(clipped.measurement[inside] == 51.2) < 20
 
 
-@pytest.mark.parametrize("resolution", [0.001, 0.01])
+@pytest.mark.parametrize("resolution", [1e-6, 0.001])
 def test_an_experiment_ends_where_the_sensor_freezes(resolution):
     record = controlled(lambda t: 50.0 + 10.0 * (t > 200.0) - 5.0 * (t > 1000.0))
     y = np.round(record.measurement / resolution) * resolution
@@ -237,6 +237,14 @@ def test_a_process_that_rests_in_a_sensor_without_noise_is_not_frozen():
     record = commanded([500.0, 1500.0, 1600.0], [0, 1, 0.1, 1], noise=0.0)
     for digits in (0, 1, 2, 4, 12):
         assert frozen(np.round(record.measurement, digits)) == []
+
+
+def test_a_position_that_rests_in_a_dead_zone_is_not_frozen():
+    """A saw of the command moves it by steps of an encoder, to another level each time."""
+    time = np.arange(0.0, 60.0, 0.02)
+    saw = 4.0 * np.abs((time / 12.0) % 1.0 - 0.5) - 1.0
+    speed = np.where(np.abs(saw) > 0.6, 2000.0 * saw + 300.0, 0.0)
+    assert frozen(np.round(np.cumsum(0.02 * speed))) == []
 
 
 @pytest.mark.parametrize("tau", [0.1, 0.5])
