@@ -278,10 +278,12 @@ def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
     records: list[Record] = []
     notes: list[str] = []
     faults: list[BagError] = []
-    for log in read_csv(path, wanted):
+    for number, log in enumerate(read_csv(path, wanted)):
         notes += log.notes
+        if number and wanted.command_before is not None:
+            notes.append("--command-before was used for the first recording in the file alone")
         try:
-            command = preceded(log.command, wanted.command_before)
+            command = preceded(log.command, None if number else wanted.command_before)
             record = _in_units(join(log.measurement, command, dated=log.dated), log.units)
             if len(log.command) != len(log.measurement):
                 unseen = max(record.unseen, _between_readings(log.command))

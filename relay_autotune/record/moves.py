@@ -79,6 +79,16 @@ def only_move(u: PiecewiseConstant, time: FloatArray) -> float | None:
     return float(moves[0]) if moves.size == 1 else None
 
 
+def begins_with_only_move(u: PiecewiseConstant, time: FloatArray) -> bool:
+    """Return whether an input changes once, before a rest could be seen.
+
+    :param u: the input.
+    :param time: of the samples [s], shape (n,).
+    """
+    move = only_move(u, time)
+    return move is not None and np.count_nonzero(time < move) < _RESTING
+
+
 def longest_stay(time: FloatArray, u: Input) -> float:
     """Return the longest time between samples for which an input stood still [s].
 

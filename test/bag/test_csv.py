@@ -640,6 +640,11 @@ def test_a_step_before_the_first_row_needs_the_command_before_it(tmp_path):
     (record,) = read_experiments(path, Selection(command_before=0.0)).experiments
     held = record.input()
     assert (held.initial, held.times.tolist(), held.values.tolist()) == (0.0, [0.0], [10.0])
+    # Before the next one it was what it was in this one, or nobody knows.
+    back = "".join(f"{a:.2f},-10,{1000.0 - b:.2f}\n" for a, b in zip(t, speed, strict=True))
+    found = read_experiments(write(tmp_path / "b.csv", text + back), Selection(command_before=0.0))
+    assert [r.input().values.tolist() for r in found.experiments] == [[10.0]]
+    assert "used for the first recording in the file alone" in " ".join(found.notes)
 
 
 def test_rows_that_share_a_coarse_stamp_are_spread_up_to_the_next_one(tmp_path):

@@ -182,3 +182,17 @@ def test_a_step_from_a_known_command_begins_from_rest():
         Record(time=time, measurement=y, command=np.full(n, 15.0), held_input=u)
     )
     assert found.model.gain == pytest.approx(3.1, rel=0.05)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_position_under_one_step_is_no_lag_beside_a_drift(seed):
+    """A lag of the other sign and a drift together answer as it does."""
+    time = 0.01 * np.arange(1500)
+    u = PiecewiseConstant(np.zeros(1), np.array([15.0]), 0.0)
+    motor = TransferFunction(15.2, time_constants=(1.42,), integrators=1)
+    noise = 0.35 * np.random.default_rng(seed).standard_normal(time.size)
+    y = 0.5 * np.round((response(motor, time, u) + noise) / 0.5)
+    found = analyse(Record(time=time, measurement=y, command=np.full(1500, 15.0), held_input=u))
+    assert found.verdict is Verdict.TRUSTED
+    assert (found.model.structure, found.best_gains.kc > 0.0) == ("integrator_lag", True)
+    assert found.model.model.gain == pytest.approx(15.2, rel=0.01)

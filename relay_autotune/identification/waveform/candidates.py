@@ -72,6 +72,7 @@ from relay_autotune.record.moves import (
     MOST_GROWTH,
     answers_soon,
     begins_at_rest,
+    begins_with_only_move,
     changes_within,
     is_controlled,
     longest_push,
@@ -432,9 +433,10 @@ class FitContext:
     @cached_property
     def terms(self) -> list[tuple[str, ...]]:
         """Names of the terms beside the model that the record may need, alone or together."""
-        rested = needs_no_past(self.problem, self.sign)
+        alone = _is_one_answer(self.problem)
+        rested = alone or needs_no_past(self.problem, self.sign)
         needed = {
-            "drift": True,
+            "drift": not alone,
             "relaxation": not rested,
             "past": not rested and self.problem.past_is_open,
             "unequal": self.problem.shows_its_curve,
@@ -443,9 +445,9 @@ class FitContext:
             "ends": not self.held and self.problem.shows_its_curve,
             "friction": self.held and bool(self.problem.motions),
         }
-        alone: list[tuple[str, ...]] = [(term,) for term in TERMS if needed[term]]
+        each: list[tuple[str, ...]] = [(term,) for term in TERMS if needed[term]]
         # Of a movement before the record, either part alone may explain nothing.
-        return [*alone, ("relaxation", "past")] if needed["past"] else alone
+        return [*each, ("relaxation", "past")] if needed["past"] else each
 
     def with_nuisances_of(self, candidate: Candidate) -> FitContext:
         """Return the context with the terms beside the model of a candidate, in its own colour.
@@ -657,6 +659,19 @@ def needs_no_past(problem: Problem, sign: int) -> bool:
             or begins_at_rest(time, y, u)
             for time, y, u in parts
         )
+    )
+
+
+def _is_one_answer(problem: Problem) -> bool:
+    """Return whether a record is the answer to one move, with which it begins.
+
+    Beside it a drift, a free state or a move before explain anything: an integrator and a drift
+    answer as a lag does, of either sign.
+    """
+    parts = zip(problem.experiments, problem.inputs, strict=True)
+    return all(
+        isinstance(u, PiecewiseConstant) and begins_with_only_move(u, problem.time[part])
+        for part, u in parts
     )
 
 
