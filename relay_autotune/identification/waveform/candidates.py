@@ -43,6 +43,7 @@ from relay_autotune.identification.waveform.separable import (
     residual_of,
 )
 from relay_autotune.identification.waveform.starts import (
+    ENDS,
     Guess,
     best_of,
     coarse,
@@ -284,7 +285,8 @@ class FitContext:
             "unequal": min(problem.effects(found)) >= 0.0,
             "ends": problem.ends is None
             or (
-                high - low >= least
+                # Nearer than the levels at which they are sought, they make it a switch.
+                (high - low) * (ENDS + 1) >= float(np.ptp(problem.levels))
                 and (math.isfinite(low) or math.isfinite(high))
                 and problem.time_within(low, high) >= ONE_SIDE
             ),

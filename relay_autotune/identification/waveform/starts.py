@@ -103,7 +103,7 @@ _SAME = 0.02
 _UNDECIDED = 1.05
 
 # Levels at which an actuator may end, and lags of which any process is about a sum.
-_LEVELS, _LAGS = 9, 8
+ENDS, _LAGS = 9, 8
 
 # Dead times tried at the start, as shares of the longest one.
 # Noise may make a relay switch faster than the process answers, hence those beyond 1.
@@ -336,7 +336,7 @@ def likeliest_ends(problem: Problem) -> tuple[float, float] | None:
     few, (shortest, longest) = problem.thinned(_GRID_SAMPLES, scattered=True), time_scales(problem)
     taus = _lags(shortest, longest, _LAGS)
     dead_times = longest * np.array(_SHARES[:14:2])
-    levels = np.linspace(problem.levels[0], problem.levels[-1], _LEVELS + 2)[1:-1].tolist()
+    levels = np.linspace(problem.levels[0], problem.levels[-1], ENDS + 2)[1:-1].tolist()
     ends = (-math.inf, *levels, math.inf)
     measured, answers = [], []
     parts = zip(few.experiments, few.inputs, few.delayed, few.lines, strict=True)
@@ -359,21 +359,21 @@ def likeliest_ends(problem: Problem) -> tuple[float, float] | None:
     y, rows = np.concatenate(measured), np.concatenate(answers, axis=-1).swapaxes(0, 2)
 
     def score(pair: tuple[int, int]) -> float:
-        low, high = (at % (_LEVELS + 1) for at in pair)
+        low, high = (at % (ENDS + 1) for at in pair)
         finite = [at for at in (low, high) if at]
         costs = []
         # Of each dead time, the answers to all inputs, one for each lag.
         for of in rows:
             felt = 0.5 * (of[low] + (-of[high] if high else of[0]))
             gains = np.linalg.lstsq(felt.T, y, rcond=None)[0]
-            shifts = (gains @ of[_LEVELS + at] for at in finite)
+            shifts = (gains @ of[ENDS + at] for at in finite)
             costs.append(float(np.sum(residual_of(y, np.stack((*felt, *shifts))) ** 2)))
         return information_criterion(min(costs), y.size, len(finite), y.size * NEGLIGIBLE**2)
 
-    pairs = itertools.combinations(range(_LEVELS + 2), 2)
-    apart = (p for p in pairs if p[1] - p[0] > 1 or p[0] == 0 or p[1] > _LEVELS)
+    pairs = itertools.combinations(range(ENDS + 2), 2)
+    apart = (p for p in pairs if p[1] - p[0] > 1 or p[0] == 0 or p[1] > ENDS)
     low, high = min(apart, key=score)
-    return (ends[low], ends[high]) if high - low <= _LEVELS else None
+    return (ends[low], ends[high]) if high - low <= ENDS else None
 
 
 def shifted_columns(
