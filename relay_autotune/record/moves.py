@@ -80,13 +80,13 @@ def only_move(u: PiecewiseConstant, time: FloatArray) -> float | None:
 
 
 def begins_with_only_move(u: PiecewiseConstant, time: FloatArray) -> bool:
-    """Return whether an input changes once, before a rest could be seen.
+    """Return whether an input changes once, before three samples show how the measurement moves.
 
     :param u: the input.
     :param time: of the samples [s], shape (n,).
     """
     move = only_move(u, time)
-    return move is not None and np.count_nonzero(time < move) < _RESTING
+    return move is not None and np.count_nonzero(time < move) < 3
 
 
 def longest_stay(time: FloatArray, u: Input) -> float:
