@@ -195,6 +195,16 @@ def test_models_on_which_the_loop_is_unstable_are_the_risk(record, gains, bad, r
     assert (risk.value, risk.result) == (bad / 100, result)
 
 
+def test_models_of_the_other_direction_are_the_risk(record, gains):
+    """The design leaves them out: 49 of 100 were, and the gains of an oven were trusted."""
+    mirrored = replace(PROCESS, gain=-PROCESS.gain)
+    found = replace(identified(record), draws=(PROCESS,) * 60 + (mirrored,) * 40)
+    (check,) = (check for check in CHECKS if check.name == "risk")
+    loop = Loop(gains, np.full(60, gains.ms), gains.ms)
+    (risk,) = judge((check,), Evidence(record, found, loop=loop))
+    assert (risk.value, risk.result) == (pytest.approx(0.4), Result.DOUBTFUL)
+
+
 def test_steps_and_relays_of_ordinary_processes_are_trusted(analysed):
     assert analysed.verdict is Verdict.TRUSTED
     assert completed().verdict is Verdict.TRUSTED

@@ -99,6 +99,10 @@ def _risk(evidence: Evidence) -> Measured | None:
     if loop is None or not loop.ms_around.size:
         return None
     share = float(np.mean(loop.ms_around > _FAR_ABOVE * loop.asked))
+    # The design leaves models of the other direction out, on which no gains are stable.
+    sign, draws = evidence.found.model.process_sign, evidence.found.draws
+    against = float(np.mean([m.process_sign != sign for m in draws])) if draws else 0.0
+    share = against + (1.0 - against) * share
     n = len(evidence.record)
     if share <= _LIKELY_BAD and n < LEAST_SAMPLES:
         return not_known(f"{n} samples show too little of the process; {LEAST_SAMPLES} are needed")
