@@ -451,6 +451,17 @@ def test_a_command_from_outside_is_not_fed_back(command):
     assert share is None or share < 0.01
 
 
+def test_a_command_that_stands_still_while_the_process_answers_is_no_law():
+    """Steps that are recorded a row late seem to follow a fast process: 0.97 was read backward."""
+    rng, time = np.random.default_rng(0), 0.05 * np.arange(1200)
+    levels = rng.uniform(-3.0, 3.0, 40)
+    u = PiecewiseConstant(time[::30], levels, 0.0)
+    model = TransferFunction.fopdt(1.0, 0.05, 0.0)
+    y = response(model, time + 0.05, u) + rng.normal(0.0, 0.05, time.size)
+    record = Record(time=time, measurement=y, command=np.repeat(levels, 30))
+    assert read_backward(record, model, response(model, time, record.input())) is None
+
+
 @pytest.mark.parametrize(("tau", "result"), [(8.0, Result.PASSED), (0.2, Result.DOUBTFUL)])
 def test_an_answer_between_few_samples_is_not_trusted(record, gains, tau, result):
     found = fitted_as(TransferFunction.fopdt(2.0, tau, 0.1), record)

@@ -25,6 +25,8 @@ _LEAST_SAMPLES = 24
 _ALIKE = 1e-6
 # The last samples of a record that are looked at.
 _MOST_CHANGES = 20_000
+# Numbers of a law.
+_NUMBERS = 2 * PAST + 2
 # Least number of means in a model's response, in which it then does not answer at once, and in the
 # record.
 _BLOCKS_OF_RESPONSE, _BLOCKS = 20.0, 100
@@ -54,15 +56,22 @@ def read_backward(record: Record, model: TransferFunction, fitted: FloatArray) -
     response: from row to row, rounding and noise hide a slow law, as that of an integral is. What
     the means leave of the command's power counts.
 
+    A law follows the measurement; a command that stands still for longer than the whole response
+    takes does not.
+
     The law of a controller is stable, or it integrates. One that grows is the process itself: it
     answers within the means, and its command from its answer, without the dead time, grows.
 
     :param record: any record.
     :param model: the model fitted to it.
     :param fitted: its measurement at the samples, NaN where it was not fitted, shape (n,).
-    :return: None where samples are few, or the command moves no more often than a law has numbers.
+    :return: None where samples are few, or the command moves no more often than a law has numbers,
+        or the response is over before it moves again.
     """
     u, y = record.command[-_MOST_CHANGES:], record.measurement[-_MOST_CHANGES:]
+    stay = float(np.median(np.diff(np.flatnonzero(np.diff(u))))) if np.ptp(u) > 0.0 else 0.0
+    if stay > max(model.response_time / record.mean_interval, _NUMBERS):
+        return None
     e = np.nan_to_num(record.measurement - fitted)[-_MOST_CHANGES:]
     longest = min(
         model.response_time / (_BLOCKS_OF_RESPONSE * record.mean_interval), u.size / _BLOCKS
@@ -90,8 +99,7 @@ def _read_backward(
     :param model: the model.
     """
     u, y = u - u.mean(), y - y.mean()
-    numbers = 2 * PAST + 2
-    if u.size < _LEAST_SAMPLES or np.count_nonzero(np.diff(u)) <= numbers or not np.ptp(y) > 0.0:
+    if u.size < _LEAST_SAMPLES or np.count_nonzero(np.diff(u)) <= _NUMBERS or not np.ptp(y) > 0.0:
         return None
     u_size, y_size = float(np.std(u)), float(np.std(y))
     e = e[PAST:] / y_size
