@@ -61,6 +61,15 @@ def test_a_step_with_rest_ten_times_as_long_as_itself_around_it():
     assert begin == pytest.approx(1000.0 - 10.0 * moved, abs=10.0)
 
 
+def test_what_moves_before_the_first_change_is_no_rest():
+    """An answer to a move before the recording was cut off as if it were one."""
+    record = commanded([2500.0], [0, 1])
+    moved = 30.0 * np.exp(-record.time / 300.0)
+    (found,) = find_experiments(replace(record, measurement=record.measurement - moved))
+    assert found.first == 0
+    assert find_experiments(record)[0].first > 0
+
+
 def test_a_pulse_is_one_experiment_and_far_steps_are_two():
     (pulse,) = spans(commanded([1000.0, 1030.0], [0, 1, 0]))
     assert pulse[0] == "pulses"
