@@ -255,7 +255,9 @@ class Estimate:
         gain_changes = -gain * (size_changes + by_frequency.real * frequency_changes)
 
         def deviation(gradient: FloatArray) -> float:
-            return math.sqrt(max(float(gradient @ self.covariance @ gradient), 0.0))
+            # Of a model that is hardly known it is infinite.
+            with np.errstate(over="ignore"):
+                return math.sqrt(max(float(gradient @ self.covariance @ gradient), 0.0))
 
         return deviation(gain_changes), deviation(frequency_changes)
 

@@ -218,6 +218,8 @@ def _left(
     late = 0.0
     for up in (True, False):
         ends = 1 + np.flatnonzero(rises[1:] == up)
+        if not ends.size:
+            continue
         there = y if up else -y
         level = np.median(there[at[ends]]) - margin
         for begin, end in zip(at[ends - 1], at[ends], strict=True):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +26,7 @@ from relay_autotune.record.cycles import (
     cycle_bounds,
     cycle_from_samples,
     cycles_of,
+    follow_measurement,
     infer_settings,
     limit_cycle,
 )
@@ -331,3 +333,12 @@ def test_columns_of_dates_or_other_things_than_real_numbers_are_refused(unit):
     column = np.arange(10).astype(unit)
     with pytest.raises(RecordError, match=re.escape(f"real numbers, found {column.dtype}")):
         Record(time=column, measurement=np.zeros(10), command=np.zeros(10))
+
+
+def test_two_switches_follow_or_do_not_without_a_warning():
+    time = np.arange(0.0, 60.0)
+    record = Record(time=time, measurement=np.sin(time / 9.0), command=np.ones(60))
+    with np.errstate(all="raise"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for rises in ([False, True], [True, False]):
+            follow_measurement(record, np.array([10, 40]), np.array(rises))
