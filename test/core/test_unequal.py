@@ -218,3 +218,18 @@ def test_a_command_that_is_hardly_ever_followed_shows_no_end():
     assert context.problem.time_within(6.4, np.inf) < 0.03
     (simple,) = context.fit(["fopdt"])
     assert context.ends is not None and not context.with_terms(simple, ("ends",))
+
+
+def test_ends_that_are_too_near_to_be_sought_are_none():
+    """A vehicle's depth under its controller came out as that of a switch, with an Ms of 4."""
+    rng, time = np.random.default_rng(0), 0.1 * np.arange(1500.0)
+    levels = rng.uniform(-1.0, 1.0, 150)
+    levels[::6] *= 0.03
+    command = np.repeat(levels, 10)
+    process = FOPDT.of_fields(gain=30.0, time_constants=[1.0], dead_time=0.1)
+    felt = PiecewiseConstant.from_samples(time, np.clip(command, -0.03, 0.03))
+    measured = response(process, time, felt) + 0.01 * rng.standard_normal(time.size)
+    u = Record(time, measured, command).drive()
+    context = FitContext.of(problem_of([(time, measured, u)], FOPDT), 0, held=False)
+    (simple,) = context.fit(["fopdt"])
+    assert context.ends is not None and not context.with_terms(simple, ("ends",))
