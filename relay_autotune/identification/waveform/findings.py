@@ -353,6 +353,12 @@ def _warnings(
         found.append(
             "the measurement drifts, and the drift was fitted with the model; wait for rest"
         )
+    moved = fit.problem.relaxation or fit.problem.past
+    if moved and records[0].settings is None:
+        found.append(
+            "the process moved when the record began, which was fitted with the model: where it "
+            "had rested under another command, give that as --command-before"
+        )
     if _began_away(records, fit):
         found.append(
             "the process was not at rest at the baseline when the test began, and its way there "
