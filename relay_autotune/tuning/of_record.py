@@ -75,9 +75,9 @@ def _with_noise(options: DesignOptions, chosen: Identification, record: Record) 
     # The controller will see single samples, not means of many.
     before = record.unthinned
     if math.isnan(options.noise_std):
-        measured = record.noise_std if record.noise_std > 0.0 else chosen.fit.residual_rms
-        measured = measured if before is None else before.noise
-        options = replace(options, noise_std=measured)
+        # Of a coarse sensor's noise second differences may tell nothing; what moves slowly is none.
+        measured = record.noise if before is None else before.noise
+        options = replace(options, noise_std=measured or chosen.fit.residual_rms)
     if math.isnan(options.amplitude):
         # Without relay settings: half of the command's range.
         settings, half = record.settings, 0.5 * float(np.ptp(record.command))

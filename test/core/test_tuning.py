@@ -19,10 +19,12 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.waveform.method import identify_waveform
 from relay_autotune.loop.analysis import analyse_loop, is_stable
 from relay_autotune.loop.gains import Controller
+from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import RelaySettings
+from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 from relay_autotune.tuning import design, tune
 from relay_autotune.tuning.ensemble import ensemble
+from relay_autotune.tuning.of_record import task_of_record
 from relay_autotune.tuning.task import DesignOptions, DesignTask
 
 
@@ -132,3 +134,17 @@ def test_gains_of_less_than_a_sample_are_told_as_an_integral_controller():
         DesignTask(model=replace(fast, time_constants=(5.0,)), options=DesignOptions()), "robust"
     )
     assert "integral controller" not in slow.reason
+
+
+def test_what_moves_slowly_is_no_noise_to_the_design():
+    """The drift of a room that a model leaves kept its gains four times too calm."""
+    rng, time = np.random.default_rng(3), np.arange(0.0, 1200.0)
+    u = PiecewiseConstant(np.array([100.0, 500.0, 900.0]), np.array([1.0, 0.0, 1.0]), 0.0)
+    process = TransferFunction.sopdt(2.0, (60.0, 10.0), 5.0)
+    slow = np.cumsum(rng.normal(0.0, 0.01, time.size))
+    y = response(process, time, u) + slow + rng.normal(0.0, 0.005, time.size)
+    record = Record(time=time, measurement=y, command=u(time))
+    found = identify_waveform(record)
+    task = task_of_record(found, record, DesignOptions(), None)
+    assert found.fit.residual_rms > 0.03
+    assert task.options.noise_std == pytest.approx(0.008, rel=0.2)
