@@ -86,7 +86,7 @@ def begins_with_only_move(u: PiecewiseConstant, time: FloatArray) -> bool:
     :param time: of the samples [s], shape (n,).
     """
     move = only_move(u, time)
-    return move is not None and np.count_nonzero(time < move) < 3
+    return move is not None and int(np.count_nonzero(time < move)) < 3
 
 
 def longest_stay(time: FloatArray, u: Input) -> float:
@@ -126,7 +126,7 @@ def left_by_one_sine(time: FloatArray, y: FloatArray, u: Input) -> float:
     :return: rms; NaN where the command is not two whole periods of one sine.
     """
     h = longest_push(time, u) / 3.0
-    if not 12.0 * h <= time[-1] - time[0]:
+    if not isinstance(u, PiecewiseConstant) or not 12.0 * h <= time[-1] - time[0]:
         return math.nan
     inside = (time >= time[0] + h) & (time <= time[-1] - h)
     t = time[inside]

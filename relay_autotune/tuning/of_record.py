@@ -75,7 +75,7 @@ def _with_noise(options: DesignOptions, chosen: Identification, record: Record) 
     # The controller will see single samples, not means of many.
     before = record.unthinned
     if math.isnan(options.noise_std):
-        # Of a coarse sensor's noise second differences may tell nothing; what moves slowly is none.
+        # What moves slowly is none, though a coarse sensor may show nothing else.
         measured = record.noise if before is None else before.noise
         options = replace(options, noise_std=measured or chosen.fit.residual_rms)
     if math.isnan(options.amplitude):
