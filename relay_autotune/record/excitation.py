@@ -514,8 +514,9 @@ def _with_rest(
             low = first
         part = record.measurement[low : high + 1]
         lasting = record.time[high] > record.time[low]
-        # Many switches by the clock show a response below the noise, too.
-        least = 0.0 if kind == "sequence" else 3.0 * _NOISE * noise
+        # Many switches by the clock show a response below the noise, and so may those of a
+        # controller, whose answers from row to row look like noise.
+        least = 0.0 if kind in ("sequence", "closed loop") else 3.0 * _NOISE * noise
         if part.size < 10 or not lasting or float(np.ptp(part)) <= least:
             continue
         stretches.append(Stretch(low, high, kind, reason))

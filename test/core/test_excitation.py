@@ -145,6 +145,15 @@ def test_a_loop_at_rest_is_no_experiment():
     assert spans(controlled(lambda t: 0.0)) == []
 
 
+def test_a_closed_loop_moves_though_its_answers_from_row_to_row_look_like_noise():
+    """A servo whose controller jumps from end to end at each row was told that nothing moves."""
+    rng, k = np.random.default_rng(4), np.arange(400)
+    chatter = rng.normal(0.0, 0.3, k.size)
+    step = 1.4 * (k > 200)
+    record = Record(time=0.1 * k, measurement=step + chatter, command=4.0 * step + 9.0 * chatter)
+    assert [found.kind for found in find_experiments(record)] == ["closed loop"]
+
+
 @pytest.mark.nightly
 def test_a_loop_at_rest_gives_no_gains_even_where_it_is_asked_to():
     """Its command follows the noise: read as its cause, that is a model of the controller."""
