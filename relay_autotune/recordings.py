@@ -294,6 +294,10 @@ def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
             continue
         records += found
         notes += said
+    if not records and len(faults) > 1:
+        raise BagError(
+            f"none of the {len(faults)} recordings in the file can be used; the first: {faults[0]}"
+        )
     if not records:
         raise faults[0]
     return records, [*notes, *(f"one of the recordings is left out: {f}" for f in faults)]

@@ -645,6 +645,8 @@ def test_a_step_before_the_first_row_needs_the_command_before_it(tmp_path):
     found = read_experiments(write(tmp_path / "b.csv", text + back), Selection(command_before=0.0))
     assert [r.input().values.tolist() for r in found.experiments] == [[10.0]]
     assert "used for the first recording in the file alone" in " ".join(found.notes)
+    with pytest.raises(BagError, match=r"none of the 2 recordings in the file.*never changes"):
+        read_experiments(tmp_path / "b.csv")
 
 
 def test_rows_that_share_a_coarse_stamp_are_spread_up_to_the_next_one(tmp_path):
