@@ -502,14 +502,8 @@ def _with_rest(
         high = int(np.searchsorted(record.time, min(end + length, latest), side="right")) - 1
         low, high = max(low, first), min(high, last)
         before = _without_outliers(record.measurement[first:low])
-        if (
-            not k
-            and before.size
-            and float(np.ptp(before))
-            > max(
-                2.0 * _NOISE * noise, _SHARE * float(np.ptp(record.measurement[first : last + 1]))
-            )
-        ):
+        still = max(2.0 * _NOISE * noise, _SHARE * float(np.ptp(record.measurement[first:last])))
+        if not k and before.size and float(np.ptp(before)) > still:
             # No rest: a move before the recording may have made it.
             low = first
         part = record.measurement[low : high + 1]

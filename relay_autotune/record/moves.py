@@ -79,13 +79,16 @@ def only_move(u: PiecewiseConstant, time: FloatArray) -> float | None:
     return float(moves[0]) if moves.size == 1 else None
 
 
-def begins_with_only_move(u: PiecewiseConstant, time: FloatArray) -> bool:
+def begins_with_only_move(time: FloatArray, u: Input) -> bool:
     """Return whether an input changes once, before three samples show how the measurement moves.
 
-    :param u: the input.
+    Beside the answer a drift, a free state or a move before then explain anything: an integrator
+    and a drift answer as a lag does, of either sign.
+
     :param time: of the samples [s], shape (n,).
+    :param u: the input.
     """
-    move = only_move(u, time)
+    move = only_move(u, time) if isinstance(u, PiecewiseConstant) else None
     return move is not None and int(np.count_nonzero(time < move)) < 3
 
 

@@ -435,7 +435,7 @@ class FitContext:
     @cached_property
     def terms(self) -> list[tuple[str, ...]]:
         """Names of the terms beside the model that the record may need, alone or together."""
-        alone = _is_one_answer(self.problem)
+        alone = all(begins_with_only_move(time, u) for time, u in self._parts)
         rested = alone or needs_no_past(self.problem, self.sign)
         needed = {
             "drift": not alone,
@@ -661,19 +661,6 @@ def needs_no_past(problem: Problem, sign: int) -> bool:
             or begins_at_rest(time, y, u)
             for time, y, u in parts
         )
-    )
-
-
-def _is_one_answer(problem: Problem) -> bool:
-    """Return whether a record is the answer to one move, with which it begins.
-
-    Beside it a drift, a free state or a move before explain anything: an integrator and a drift
-    answer as a lag does, of either sign.
-    """
-    parts = zip(problem.experiments, problem.inputs, strict=True)
-    return all(
-        isinstance(u, PiecewiseConstant) and begins_with_only_move(u, problem.time[part])
-        for part, u in parts
     )
 
 
