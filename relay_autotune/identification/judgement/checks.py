@@ -69,8 +69,9 @@ def read_backward(record: Record, model: TransferFunction, fitted: FloatArray) -
         or the response is over before it moves again.
     """
     u, y = record.command[-_MOST_CHANGES:], record.measurement[-_MOST_CHANGES:]
-    stay = float(np.median(np.diff(np.flatnonzero(np.diff(u))))) if np.ptp(u) > 0.0 else 0.0
-    if stay > max(model.response_time / record.mean_interval, _NUMBERS):
+    stays = np.diff(np.flatnonzero(np.diff(u)))
+    answered = max(model.response_time / record.mean_interval, _NUMBERS)
+    if 2 * np.count_nonzero(stays > answered) >= stays.size:
         return None
     e = np.nan_to_num(record.measurement - fitted)[-_MOST_CHANGES:]
     longest = min(
