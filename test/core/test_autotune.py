@@ -24,7 +24,6 @@ from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.record.cycles import cycles_of
 from relay_autotune.record.record import Outcome, Record, RelaySettings
 from relay_autotune.result import Analysis
 from relay_autotune.tuning import RULES
@@ -213,7 +212,7 @@ def test_the_end_of_a_disturbed_record_remembers_what_drove_the_process_before()
     draws[150:220] += 0.5
     relay = RelaySettings(0.0, 0.0, 1.0, 0.3, 0.1)
     whole = replace(simulate_sampled_relay(slow, relay, period=0.2, noise=draws), noise_std=0.02)
-    end = last_cycles(whole, cycles_of(whole))
+    end = last_cycles(whole)
     assert end is not None
     origin = whole.time[len(whole) - len(end)]
     earlier = end.time - 50.0

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -78,24 +77,6 @@ def test_a_load_that_comes_later_is_borne():
     first, last = tune.cycles[1], tune.cycles[-1]
     share = first.period_high / first.period
     assert last.period_high / last.period == pytest.approx(share, abs=0.05)
-
-
-@pytest.mark.parametrize(("end", "left_out"), [(1.02, True), (1.6, False)])
-def test_the_end_alone_is_judged_by_what_it_leaves_beyond_the_noise(end, left_out):
-    # Where the noise is large, no fit can leave half of what the whole record's leaves.
-    tune = run(noise_std=0.1, min_cycles=4)
-    record = tune.record()
-    found = identify(record, "waveform", Known(structure="fopdt"))
-
-    def leaving(times, part=record):
-        left = times * record.noise_std * (-1.0) ** np.arange(len(part))
-        fit = replace(found.fit, residual_rms=times * record.noise_std)
-        return replace(found, fit=fit, fitted=part.measurement - left)
-
-    whole = leaving(1.86)
-    chosen = without_disturbance(record, lambda p: whole if p is record else leaving(end, p))
-    assert any("left out" in text for text in chosen.warnings) is left_out
-    assert (chosen is whole) is not left_out
 
 
 def test_a_load_that_stops_the_oscillation_is_borne():

@@ -36,24 +36,8 @@ from relay_autotune.record.record import Cycle, PiecewiseConstant, Record, Relay
 # the noise is noise alone; 2 % of the measurement's spread is left by any simple structure.
 _OF_NOISE = 1.3
 _OF_SPREAD = 0.02
-# Misfit beyond which a model is of another process.
+# Ratio of a residual to the larger of both beyond which a model is of another process.
 _FAR_OFF = 2.0
-
-
-def misfit(found: Identification, record: Record, *, noise: float | None = None) -> float:
-    """Return the residual over the largest one of a good fit, so that up to 1 is good.
-
-    :param found: what was identified.
-    :param record: the record.
-    :param noise: standard deviation of the noise [y]; default: that measured before the test, 0
-        where it was not measured.
-    :return: NaN where the residual is not known.
-    """
-    known = record.noise_std if noise is None else noise
-    spread = _OF_SPREAD * float(np.std(record.measurement))
-    allowed = max(_OF_NOISE * known if math.isfinite(known) else 0.0, spread)
-    residual = found.fit.residual_rms
-    return residual / allowed if allowed > 0.0 else (math.inf if residual > 0.0 else 0.0)
 
 
 def unexplained_share(found: Identification, record: Record, residual: float) -> float:
@@ -78,7 +62,8 @@ def is_far_off(found: Identification, record: Record) -> bool:
     :param found: what was identified.
     :param record: the record.
     """
-    return misfit(found, record, noise=record.noise) > _FAR_OFF
+    allowed = max(_OF_NOISE * record.noise, _OF_SPREAD * float(np.std(record.measurement)))
+    return found.fit.residual_rms > _FAR_OFF * allowed
 
 
 _POINTS = 512
