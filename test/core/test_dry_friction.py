@@ -4,12 +4,16 @@
 """Dry friction of a position, which is estimated with the model and named."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from relay_autotune import ExperimentParameters, Known, RelayExperiment, identify
-from relay_autotune.identification.waveform.problem import motions_of
+from relay_autotune.identification.waveform.candidates import FitContext
+from relay_autotune.identification.waveform.problem import motions_of, problem_of
+from relay_autotune.identification.waveform.separable import evaluate
+from relay_autotune.process.structures import FOPDT, structure_named
 from relay_autotune.record.record import Outcome
 
 # rad/s for a volt, and seconds to reach it.
@@ -55,6 +59,23 @@ def test_no_friction_is_found_where_there_is_none():
     found = identify(servo_record(0.0), known=Known(structure="integrator_lag"))
     assert found.friction == 0.0
     assert found.model.gain == pytest.approx(GAIN, rel=0.02)
+
+
+@pytest.mark.parametrize(("times", "is_one"), [(1.0, True), (40.0, False)])
+def test_friction_beyond_all_commands_is_none(times, is_one):
+    """Nothing would move; a fan was trusted as an integrator with three times its range."""
+    record = servo_record(0.15)
+    u = record.drive()
+    problem = replace(
+        problem_of([(record.time, record.measurement, u)], structure_named("integrator_lag")),
+        motions=motions_of(record.time, record.measurement, u),
+        friction=True,
+    )
+    fit = evaluate(problem, np.array([math.log(LAG), 0.5 * PERIOD]))
+    fit.coefficients[problem.places("friction")] *= times
+    assert 0.1 * times < problem.dry_friction(fit.coefficients) < 0.3 * times
+    context = FitContext.of(replace(problem, structure=FOPDT, friction=False), 0, held=True)
+    assert (context.candidate(problem, fit) is not None) is is_one
 
 
 @pytest.mark.parametrize(("noise", "seen"), [(0.0, True), (20.0 * ENCODER, False)])

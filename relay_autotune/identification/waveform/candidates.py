@@ -290,7 +290,9 @@ class FitContext:
                 and (math.isfinite(low) or math.isfinite(high))
                 and problem.time_within(low, high) >= ONE_SIDE
             ),
-            "friction": not problem.friction or problem.dry_friction(found) >= least,
+            # Beyond all commands nothing would move.
+            "friction": not problem.friction
+            or least <= problem.dry_friction(found) <= float(np.ptp(problem.levels)),
             "play": not problem.play or least <= problem.play_of(found) <= most,
         }
         wrong = [term for term, may_be in possible.items() if not may_be]
