@@ -203,8 +203,8 @@ class GainsClient(LoopClient):
         try:
             yield
         finally:
-            # One that hangs may come back.
-            if raised:
+            # One that hangs may come back; one that has gone has lost them.
+            if raised and self._action.server_is_ready():
                 with suppress(LoopError):
                     self.set_values(self.name, {name: before[name] for name in raised})
 
@@ -270,7 +270,11 @@ class GainsClient(LoopClient):
             try:
                 return self._verified(goal, tell, leave)
             except GoneError as error:
-                raise GoneError(f"{error}; {self._taken_back(target, there)}") from error
+                # Who is lost is no reason to leave the rest undone; after it nobody waits for it.
+                why_lost, self.why_lost = self.why_lost, lambda: ""
+                left = self._taken_back(target, there)
+                self.why_lost = why_lost
+                raise GoneError(f"{error}; {left}") from error
 
     def _there(self) -> tuple[str, dict[str, str]]:
         """Return the node that has the gains, and its parameter for each."""
@@ -285,8 +289,6 @@ class GainsClient(LoopClient):
         :param target: the other node; the controller_node itself: there is none.
         :param before: its parameters.
         """
-        # Who is lost is no reason any longer to leave the rest undone.
-        self.why_lost = lambda: ""
         if target == self.name:
             return (
                 "nobody controls the loop; started again, it begins with the gains that were "

@@ -379,6 +379,8 @@ def test_what_a_node_allows_is_raised_until_the_end_of_a_block() -> None:
     client.name = "/controller_node"
     client.values = lambda node, names: {name: there[name] for name in names}
     client.set_values = lambda node, values: there.update(values)
+    is_ready = [True]
+    client._action = SimpleNamespace(server_is_ready=lambda: is_ready[-1])
     with client.allowing(accept_doubtful=True, verify_step_max=0.2):
         assert there == {"accept_doubtful": True, "verify_step_max": 0.5}
     assert there == before
@@ -389,6 +391,35 @@ def test_what_a_node_allows_is_raised_until_the_end_of_a_block() -> None:
     with pytest.raises(GoneError), client.allowing(verify_step_max=2.0):
         raise GoneError("it hangs, and comes back")
     assert there == before
+    with pytest.raises(GoneError), client.allowing(verify_step_max=2.0):
+        is_ready.append(False)
+        # Its answer would be waited for in vain.
+        client.set_values = None
+        raise GoneError("it has gone")
+
+
+def test_where_a_node_is_lost_the_gains_go_back_and_it_is_not_waited_for() -> None:
+    """Its service is there for a while after its end, and why it was lost ends each wait."""
+    places, written = {"kc": "p", "ti": "i", "td": "d"}, []
+    there = {"verify_step_max": 0.0, "p": 0.1, "i": 3.0, "d": 0.0}
+    client: Any = GainsClient.__new__(GainsClient)
+    client.name, client.why_lost, client.left_behind = "/own", lambda: "killed", ""
+    client._action = SimpleNamespace(server_is_ready=lambda: True)
+    client._there = lambda: ("/other", places)
+    client.values = lambda node, names: {name: there[name] for name in names}
+
+    def set_values(node: str, values: Any) -> None:
+        there.update(values)
+        written.append((node, client.why_lost()))
+
+    def verified(*_: object) -> None:
+        there["p"] = 0.2
+        raise GoneError(client.why_lost())
+
+    client.set_values, client._verified = set_values, verified
+    with pytest.raises(GoneError, match=r"^killed; /other has .*p 0\.1, as before$"):
+        client.prove(0.5, 0.0, 60.0, lambda _: None)
+    assert written == [("/own", "killed"), ("/other", ""), ("/own", "killed")]
 
 
 def test_gains_that_are_on_their_way_to_the_node_are_no_reason_to_be_told() -> None:
