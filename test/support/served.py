@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
@@ -157,6 +157,17 @@ class OpenPage:
             self._socket.write_message(json.dumps({"do": wish, "loop": self._number, **more}))
 
         self._loop.call_soon_threadsafe(send)
+
+    def plan(self, until: Callable[..., Any], wish: str = "start", **more: Any) -> dict[str, Any]:
+        """Ask what a wish would do, and return the answer.
+
+        :param until: waits for a condition.
+        """
+        number = self.snapshot["plan"]["number"] + 1
+        self.do(wish, dry=number, **more)
+        # A second wish on its way would be a second check, during which no tune can be started.
+        until(lambda: self.snapshot["plan"]["number"] == number and self.phase == "idle", "a plan")
+        return self.snapshot["plan"]
 
     def close(self) -> None:
         """Close the browser."""

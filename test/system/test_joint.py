@@ -59,29 +59,29 @@ def test_a_joint_is_tuned_on_a_page_which_verifies_gains_between_two_tunes(rig: 
     found = rig.until(lambda: re.search(r"the page is at (\S+)", command.log), "the address", 60.0)
     page = OpenPage(found[1])
 
-    def accepted() -> bool:
-        count = page.snapshot["checked"]
-        page.do("check")
-        rig.until(lambda: page.snapshot["checked"] > count and page.phase == "idle", "a check")
-        return bool(page.snapshot["accepted"])
+    def accepts() -> bool:
+        return not page.plan(rig.until)["refusal"]
 
-    rig.until(lambda: page.snapshot.get("form"), "the form")
-    assert [row["name"] for row in page.snapshot["form"]] == ["within", "amplitude"]
-    rig.until(accepted, "a check that accepts", 60.0)
-    told = {name: found for _, name, found in page.snapshot["checks"]}
+    rig.until(lambda: page.snapshot, "what is known")
+    rig.until(accepts, "a check that accepts", 60.0)
+    plan = page.snapshot["plan"]
+    assert [row["name"] for row in plan["form"]] == ["within", "amplitude"]
+    told = {name: found for _, name, found in plan["lines"]}
     assert told["moves"].startswith("the reference of left_wheel about")
     page.do("start")
     rig.until(lambda: page.snapshot["status"] == "the tune is complete", "the tune", 240.0)
     assert robot.gains() == before
     rig.until(lambda: page.snapshot["controller"].endswith("/controller_node"), "it", 60.0)
-    rig.until(lambda: page.snapshot["step"], "the usual step")
-    asked = page.subjects[0]["first"]
-    page.do("apply", of=0, asked=asked, step=page.snapshot["step"], accept_doubtful=True)
+    gains = {"of": 0, "asked": page.subjects[0]["first"], "accept_doubtful": True}
+    plan = page.plan(rig.until, "prove", **gains)
+    assert not plan["refusal"]
+    (step,) = plan["form"][0]["values"]
+    page.do("prove", step=step, **gains)
     rig.until(lambda: "verification" in page.snapshot["status"], "the verification", 120.0)
     assert page.snapshot["status"].startswith("verification passed"), page.snapshot["status"]
     assert robot.gains() != before
     # It makes way for the next tune.
-    rig.until(accepted, "a second check that accepts", 60.0)
+    rig.until(accepts, "a second check that accepts", 60.0)
     command.signal(signal.SIGINT)
     assert command.wait(60.0) in (0, 3), command.log
     assert robot.history() == ["wheel_controller"]
