@@ -282,6 +282,8 @@ class LoopClient:
             )
         if not sent.result().accepted:
             raise LoopError(f"{self.name} has rejected the request; its log says why")
+        # It has started, which alone may take longer.
+        self._answers_within = ANSWER_WITHIN
         return sent.result()
 
     def _service(self, kind: Any, service: str) -> Any:

@@ -134,6 +134,13 @@ def test_a_node_that_starts_late_is_asked_again_until_it_answers_or_has_ended() 
         with pytest.raises(LoopError, match="/other/revert has not answered within 10 s"):
             client.call(None, "/other/revert", None)
         asked.append(None)
+        # Nor does one that takes a goal need the time of a start any more.
+        goal = SimpleNamespace(done=lambda: True, result=lambda: SimpleNamespace(accepted=True))
+        client._action = SimpleNamespace(send_goal_async=lambda *_, **__: goal)
+        client._sent(None, None)
+        with pytest.raises(LoopError, match="/loop/node/revert has not answered within 10 s"):
+            client.call(None, "/loop/node/revert", None)
+        asked.append(None)
         client.why_lost = lambda: "node has ended"
         with pytest.raises(LoopError, match="node has ended"):
             client.call(None, "/loop/node/revert", None)
