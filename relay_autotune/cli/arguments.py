@@ -18,7 +18,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-from relay_autotune.cli.terminal import Help, broken, end_with_terminal, width
+from relay_autotune.cli.terminal import Help, broken, end_with_terminal, keep_output, width
 from relay_autotune.errors import (
     MissingPackageError,
     ParameterError,
@@ -198,6 +198,7 @@ def guarded_in_graph(program: str, work: Callable[[ExitStack], int]) -> int:
         end afterwards.
     """
     end_with_terminal()
+    keep_output()
     with Graph() as graph:
         status = run_command(program, lambda: work(graph))
         if graph.joined:

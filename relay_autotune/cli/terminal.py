@@ -377,6 +377,21 @@ def end_with_terminal() -> None:
     threading.Thread(target=watch, name="terminal", daemon=True).start()
 
 
+def keep_output() -> None:
+    """Have what libraries print go to standard error: standard output is for results.
+
+    Fast DDS prints there that it could not open a port, as after a node of another user, and a
+    JSON document behind that is none. On a terminal both are the same.
+    """
+    # Else it is that of another program, or of a test.
+    output = sys.__stdout__
+    if output is not None and output is sys.stdout and not output.isatty():
+        output.flush()
+        own = os.dup(1)
+        os.dup2(2, 1)
+        sys.stdout = os.fdopen(own, "w", encoding=output.encoding, errors=output.errors)
+
+
 class Signals:
     """The signals that end a work in order: they are only noted.
 

@@ -168,3 +168,13 @@ def test_a_closed_terminal_ends_a_command_which_the_system_sends_no_signal(
     assert process.stdout.readline() == "begins\n"
     os.close(master)
     assert process.wait(30.0) == status
+
+
+def test_what_the_middleware_prints_does_not_stand_in_a_result() -> None:
+    code = (
+        "import os; from relay_autotune.cli.arguments import guarded_in_graph\n"
+        "print('before')\n"
+        "raise SystemExit(guarded_in_graph('any', lambda _: print(os.write(1, b'noise')) or 3))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (3, "before\n5\n", "noise")
