@@ -136,6 +136,24 @@ class Part:
         """Its times as text."""
         return f"{self.begin:.4g} s to {self.end:.4g} s"
 
+    def share_against(self, model: TransferFunction) -> float:
+        """Return the share of its models that are of the other direction than one of the whole.
+
+        The sign of a static gain counts where the part shows it: at the frequency of which it
+        shows one radian, the responses are then more than 90 degrees apart.
+
+        :param model: of the whole record.
+        """
+        at = np.array([1j / (self.end - self.begin)])
+        return float(
+            np.mean(
+                [
+                    m.process_sign != model.process_sign and (m(at) / model(at))[0].real < 0.0
+                    for m in self.models
+                ]
+            )
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Rival:

@@ -325,6 +325,15 @@ def test_a_part_that_works_in_the_other_direction_gives_no_gains(record, gains, 
     assert finding("direction", record, found, gains).result is result
 
 
+def test_a_static_gain_that_a_part_does_not_show_has_no_direction(record, gains):
+    # It turns with a zero that is 40 times as long as the part, and answers there as the process.
+    beyond = TransferFunction(-2.0, (-4000.0,), (4000.0, 10.0), dead_time=3.0)
+    found = replace(identified(record), parts=(Part(0.0, 100.0, (beyond,) * 40),))
+    assert finding("direction", record, found, gains).result is Result.PASSED
+    shown = replace(found, parts=(Part(0.0, 20_000.0, (beyond,) * 40),))
+    assert finding("direction", record, shown, gains).result is Result.FAILED
+
+
 def test_a_half_that_shows_nothing_objects_to_nothing():
     # The noise of the first half is twenty times that of the other.
     record = joined(PROCESS, PROCESS)

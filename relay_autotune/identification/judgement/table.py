@@ -151,19 +151,13 @@ def _direction(evidence: Evidence) -> Measured | None:
             f"it first {lowers} and then {raises} it fits the record as well: test with "
             f"process_gain_sign {sign} (0: it is found)"
         )
-    models = [
-        (said, found.draws),
-        *(
-            (f"{p.span} also fits a process of the other direction", p.models)
-            for p in found.parts
-            if p.contradicts
-        ),
-    ]
     shares = [
-        (float(np.mean([m.process_sign == sign for m in draws])), words)
-        for words, draws in models
-        if draws
+        (part.share_against(found.model), f"{part.span} also fits a process of the other direction")
+        for part in found.parts
+        if part.contradicts
     ]
+    if found.draws:
+        shares.append((float(np.mean([m.process_sign == sign for m in found.draws])), said))
     if found.opposed:
         as_well = "a process of the other direction explains the record about as well"
         shares.append((found.opposed, as_well))
