@@ -280,15 +280,13 @@ def process_text(model: TransferFunction) -> str:
 
     :param model: the process.
     """
-    above = [digits(model.gain), *map(_plain, _polynomials(model.zeros, model))]
+    above, below = _sides(model, _plain_factor, _plain_power("s", abs(model.integrators)))
+    top = " ".join([digits(model.gain), *above])
     if model.dead_time:
-        above.append(f"e^(-{digits(model.dead_time)} s)")
-    below = [_plain(p) for p in _polynomials(model.time_constants, model)]
-    if model.integrators:
-        below.insert(0, "s" if model.integrators == 1 else f"s^{model.integrators}")
+        top += f" e^(-{digits(model.dead_time)} s)"
     if not below:
-        return " ".join(above)
-    return f"{' '.join(above)} / {below[0] if len(below) == 1 else '(' + ' '.join(below) + ')'}"
+        return top
+    return f"{top} / {below[0] if len(below) == 1 else '(' + ' '.join(below) + ')'}"
 
 
 def process_latex(model: TransferFunction) -> str:
@@ -341,13 +339,6 @@ def _polynomials(constants: Iterable[complex], model: TransferFunction) -> list[
     return found
 
 
-def _plain(polynomial: _Polynomial) -> str:
-    sign = "-" if polynomial[1] < 0.0 and len(polynomial) == 2 else "+"
-    if len(polynomial) == 2:
-        return f"(1 {sign} {digits(abs(polynomial[1]))} s)"
-    return f"(1 + {digits(polynomial[1])} s + {digits(polynomial[2])} s^2)"
-
-
 def _sides(
     model: TransferFunction, draw: Callable[[_Polynomial, int], str], integrators: str
 ) -> tuple[list[str], list[str]]:
@@ -365,6 +356,25 @@ def _sides(
     return above, below
 
 
+def _plain_power(inner: str, power: int) -> str:
+    return f"{inner}^{power}" if power > 1 else inner
+
+
+def _plain_factor(polynomial: _Polynomial, power: int) -> str:
+    return _plain_power(_sum(polynomial, digits), power)
+
+
+def _sum(polynomial: _Polynomial, number: Callable[[float], str]) -> str:
+    """Return a polynomial in brackets, as plain text and LaTeX write it.
+
+    :param number: from a positive value to text.
+    """
+    text = "1"
+    for k, c in enumerate(polynomial[1:], start=1):
+        text += f" {'-' if c < 0.0 else '+'} {number(abs(c))} s" + ("^2" if k == 2 else "")
+    return f"({text})"
+
+
 def _latex_power(inner: str, power: int) -> str:
     return f"{inner}^{{{power}}}" if power > 1 else inner
 
@@ -375,10 +385,7 @@ def _latex_number(value: float) -> str:
 
 
 def _latex_factor(polynomial: _Polynomial, power: int) -> str:
-    text = "1"
-    for k, c in enumerate(polynomial[1:], start=1):
-        text += f" {'-' if c < 0.0 else '+'} {_latex_number(abs(c))} s" + ("^2" if k == 2 else "")
-    return _latex_power(f"({text})", power)
+    return _latex_power(_sum(polynomial, _latex_number), power)
 
 
 def _mathml_number(value: float) -> str:

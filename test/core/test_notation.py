@@ -26,6 +26,9 @@ MODELS = {
         -2.0, 0.5, 0.5, 0.0, zero=-3.0
     ),
     "0.1000 e^(-1.000e-05 s) / (s (1 + 3.000 s))": INTEGRATOR_LAG.build((0.1, 3.0, 1e-5)),
+    "2.000 s / (1 - 2.000 s + 5.000 s^2)": TransferFunction(
+        2.0, (), (complex(-1.0, 2.0), complex(-1.0, -2.0)), -1
+    ),
     "4.000": TransferFunction(4.0),
 }
 
@@ -48,6 +51,7 @@ def test_latex_and_mathml_have_every_number_of_the_line(model) -> None:
 
 def test_equal_lags_are_a_power() -> None:
     model = TransferFunction.lag_n(1.0, 2.0, 3, 0.5)
+    assert str(model) == "1.000 e^(-0.5000 s) / (1 + 2.000 s)^3"
     assert process_latex(model) == r"\frac{1.000}{(1 + 2.000 s)^{3}} \, e^{-0.5000 s}"
     (power,) = [
         e for e in ElementTree.fromstring(process_mathml(model)).iter("msup") if e[1].text == "3"

@@ -144,7 +144,8 @@ def _direction(evidence: Evidence) -> Measured | None:
     found, relay = evidence.found, evidence.record.settings is not None
     sign = -found.model.process_sign
     raises, lowers = ("raises", "lowers") if sign > 0 else ("lowers", "raises")
-    said = "the record also fits a process of the other direction"
+    as_well = "also fits a process of the other direction"
+    said = f"the record {as_well}"
     if relay:
         said = (
             f"the relay assumed that a higher command {lowers} the measurement; a process where "
@@ -152,15 +153,15 @@ def _direction(evidence: Evidence) -> Measured | None:
             f"process_gain_sign {sign} (0: it is found)"
         )
     shares = [
-        (part.share_against(found.model), f"{part.span} also fits a process of the other direction")
+        (part.share_against(found.model), f"{part.span} {as_well}")
         for part in found.parts
         if part.contradicts
     ]
     if found.draws:
         shares.append((float(np.mean([m.process_sign == sign for m in found.draws])), said))
     if found.opposed:
-        as_well = "a process of the other direction explains the record about as well"
-        shares.append((found.opposed, as_well))
+        said = "a process of the other direction explains the record about as well"
+        shares.append((found.opposed, said))
     return Measured(*max(shares)) if shares else None
 
 
