@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
+from relay_autotune.identification.waveform.past import drop_first_dead_time, needs_no_past
 from relay_autotune.identification.waveform.problem import (
     NEGLIGIBLE,
     ONE_SIDE,
@@ -71,22 +72,16 @@ from relay_autotune.process.structures import (
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.moves import (
     MOST_GROWTH,
-    answers_soon,
-    begins_at_rest,
     begins_with_only_move,
-    changes_within,
     is_controlled,
     longest_push,
     longest_stay,
 )
-from relay_autotune.record.record import Input, PiecewiseConstant
+from relay_autotune.record.record import Input
 
 MOST_LAGS = 8
 _MOST_LAGS_WITH_ZERO = 4
 _SAMPLES_EACH = 8
-# Least number of moves of a command that tell whether one came before the record, and show a
-# response beside a slow disturbance.
-MANY = 6
 # Gains have to hold on the models of these, too.
 PLAIN = (FOPDT.name, SOPDT.name)
 # What was before the record, and with the ends that for which a dead time or a lag can stand.
@@ -637,62 +632,3 @@ def likeliest_load(problem: Problem, state: Trial) -> float:
     answers = answers - (answers @ basis) @ basis.T
     remaining = [float(np.sum(residual_of(left, rows) ** 2)) for rows in answers.swapaxes(0, 1)]
     return float(instants[int(np.argmin(remaining))])
-
-
-def needs_no_past(problem: Problem, sign: int) -> bool:
-    """Return whether a record shows that the process was at rest before.
-
-    A free past explains any single step. Many moves tell of themselves whether one is needed: a
-    command that moved just before the record acts in the rest, or after it where the dead time is
-    longer. The latter is a coincidence where a motion follows the first move sooner than the rest
-    lasted. A relay test began where its settings say, and is asked of its samples all the same.
-
-    :param problem: all samples.
-    :param sign: the direction in which the relay worked, 1 or -1; 0: not known.
-    """
-    parts = [
-        (problem.time[part], problem.y[part], u)
-        for part, u in zip(problem.experiments, problem.inputs, strict=True)
-    ]
-    return (
-        not sign
-        and (moves_seldom(problem) or all(answers_soon(*part) for part in parts))
-        and all(
-            # A command that is known to have held until the first sample is such a rest, too.
-            (isinstance(u, PiecewiseConstant) and u.times[0] == time[0])
-            or begins_at_rest(time, y, u)
-            for time, y, u in parts
-        )
-    )
-
-
-def moves_seldom(problem: Problem) -> bool:
-    """Return whether no command moves often enough to tell what came before the record.
-
-    :param problem: all samples.
-    """
-    parts = zip(problem.experiments, problem.inputs, strict=True)
-    return all(changes_within(u, problem.time[part]).size < MANY for part, u in parts)
-
-
-def drop_first_dead_time(problem: Problem, state: Trial) -> Problem:
-    """Return the samples whose input is known; all of them where the process was at rest.
-
-    The input before the record is not known, unless it is estimated, and acts for one dead time.
-
-    :param problem: the problem.
-    :param state: a fit, for its dead time.
-    """
-    if not problem.relaxation or problem.past:
-        return problem
-    some = problem.part(problem.time >= problem.starts + float(state.theta[-1]))
-    least = min(part.stop - part.start for part in some.experiments)
-    return some if least > 4 * state.parameters and _is_driven(some) else problem
-
-
-def _is_driven(problem: Problem) -> bool:
-    """Return whether the command changes within the samples of each experiment."""
-    return all(
-        part.stop > part.start and changes_within(u, problem.time[part]).size > 0
-        for part, u in zip(problem.experiments, problem.inputs, strict=True)
-    )

@@ -28,11 +28,10 @@ from relay_autotune.identification.waveform.candidates import (
     PLAIN,
     Candidate,
     FitContext,
-    drop_first_dead_time,
-    moves_seldom,
 )
 from relay_autotune.identification.waveform.direction import opposed
 from relay_autotune.identification.waveform.fit_covariance import Fit, raw_residual
+from relay_autotune.identification.waveform.past import drop_first_dead_time, moves_seldom
 from relay_autotune.identification.waveform.problem import (
     NEGLIGIBLE,
     Problem,

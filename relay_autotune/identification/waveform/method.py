@@ -28,7 +28,6 @@ from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import LOSSES, NOTHING, Known
 from relay_autotune.identification.result import Identification
-from relay_autotune.identification.waveform.candidates import MANY
 from relay_autotune.identification.waveform.choice import (
     ANSWERED,
     SIMPLE,
@@ -45,6 +44,7 @@ from relay_autotune.identification.waveform.fit_covariance import (
     quantisation_step,
     raw_residual,
 )
+from relay_autotune.identification.waveform.past import MANY
 from relay_autotune.identification.waveform.problem import (
     NEGLIGIBLE,
     Problem,
