@@ -389,7 +389,8 @@ def keep_output() -> None:
         output.flush()
         own = os.dup(1)
         os.dup2(2, 1)
-        sys.stdout = os.fdopen(own, "w", encoding=output.encoding, errors=output.errors)
+        # By lines, as on a terminal: else the result comes after an error that followed it.
+        sys.stdout = os.fdopen(own, "w", 1, encoding=output.encoding, errors=output.errors)
 
 
 class Signals:

@@ -178,3 +178,14 @@ def test_what_the_middleware_prints_does_not_stand_in_a_result() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (3, "before\n5\n", "noise")
+
+
+def test_a_result_stands_before_the_error_that_followed_it() -> None:
+    code = (
+        "import sys; from relay_autotune.cli.arguments import guarded_in_graph\n"
+        "guarded_in_graph('any', lambda _: print('result') or sys.stderr.write('error'))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    assert done.stdout == b"result\nerror"
