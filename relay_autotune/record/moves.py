@@ -156,12 +156,17 @@ def answering_time(time: FloatArray, u: Input) -> float:
 def begins_at_rest(time: FloatArray, y: FloatArray, u: Input) -> bool:
     """Return whether an experiment begins with a rest, which shows what came before.
 
+    A measurement that does not move for a while after the first change shows as much: what acts
+    within a dead time had been commanded before the record.
+
     :param time: of the samples [s], shape (n,).
     :param y: the measurement, shape (n,).
     :param u: the input.
     """
     changes = changes_within(u, time)
     before = time < (changes[0] if changes.size else time[0])
+    first = y[: max(int(np.count_nonzero(before)), 1)]
+    before[: int(np.argmax(np.abs(y - first.mean()) > _STILL * np.ptp(y)))] = True
     if np.count_nonzero(before) < _RESTING or not np.ptp(time[before]) > 0.0:
         return False
     slope, left = _line_of(time[before], y[before])
@@ -257,9 +262,11 @@ def answers_soon(time: FloatArray, y: FloatArray, u: Input) -> bool:
     inside = (u.times >= time[0]) & (u.times < time[-1])
     then = y[np.maximum(time.searchsorted(u.times[inside]) - 1, 0)]
     up = np.diff(u.levels)[inside] > 0.0
-    if up.all() or not up.any() or abs(then[up].mean() - then[~up].mean()) < _APART * np.ptp(y):
+    turns = up.any() and not up.all()
+    if turns and abs(then[up].mean() - then[~up].mean()) < _APART * np.ptp(y):
         return False
-    rested = float(u.times[inside][0] - time[0])
+    # A command that does not change has no rest before it.
+    rested = float(u.times[inside][0] - time[0]) if up.size else 0.0
     return any(0.0 <= latest < rested for latest in first_response(time, y, u))
 
 

@@ -48,7 +48,7 @@ def test_the_command_at_which_a_process_rests_before_its_test():
     assert math.isnan(resting_command(whole.part(400, len(whole))))
     assert math.isnan(resting_command(commanded([0.0], [30, 40])))
     # A clock in coarse steps stamps many samples with one time: that is no rest.
-    coarse = commanded([3.0], [30, 40], time=np.repeat(np.arange(0.0, 50.0, 5.0), 30))
+    coarse = commanded([3.0], [30, 40], time=np.repeat(np.arange(0.0, 50.0, 15.0), 30))
     assert math.isnan(resting_command(coarse))
 
 

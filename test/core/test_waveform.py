@@ -31,7 +31,12 @@ from relay_autotune.process.response import response
 from relay_autotune.process.structures import TABLE, structure_named
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
-from relay_autotune.record.moves import first_response, is_controlled
+from relay_autotune.record.moves import (
+    answers_soon,
+    begins_at_rest,
+    first_response,
+    is_controlled,
+)
 from relay_autotune.record.record import PiecewiseConstant, Record, RelaySettings
 from relay_autotune.verdict import Verdict
 
@@ -414,6 +419,20 @@ def test_where_the_command_crosses_its_rest_a_later_response_tells_nothing():
     process = TransferFunction.fopdt(30.0, 10.0, 4.0)
     time, y, u = rested_and_moved(process, [20.0, 22.0, 30.0], [0.01, -1.0, 0.0])
     assert first_response(time, y, u) == (np.inf, np.inf)
+
+
+def test_a_process_before_a_staircase_was_at_rest():
+    """No relay or controller changes its command in one direction alone."""
+    edges, levels = 20.0 + 30.0 * np.arange(8), 0.1 * np.arange(1.0, 9.0)
+    process = TransferFunction.fopdt(30.0, 10.0, 4.0)
+    assert answers_soon(*rested_and_moved(process, edges, levels))
+    assert not answers_soon(*rested_and_moved(process, [], []))
+
+
+@pytest.mark.parametrize(("dead_time", "at_rest"), [(15.0, True), (2.0, False)])
+def test_a_process_that_has_not_answered_yet_was_at_rest(dead_time, at_rest):
+    process = TransferFunction.fopdt(30.0, 10.0, dead_time)
+    assert begins_at_rest(*rested_and_moved(process, [4.0, 60.0], [1.0, 0.0])) is at_rest
 
 
 def test_a_free_motion_does_not_stand_for_the_first_response():
