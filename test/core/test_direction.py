@@ -122,6 +122,19 @@ def test_a_process_of_two_speeds_keeps_its_direction_under_a_square_wave(up, dow
 
 
 @pytest.mark.nightly
+def test_an_inverse_response_beside_a_drift_may_be_an_answer_of_the_other_direction():
+    """A drift against the answer makes an inverse response of it, which never turns."""
+    time = 0.2 * np.arange(72.0)
+    command = np.where((time < 1.9) | (time >= 7.0), 0.0, 1.0)
+    u = PiecewiseConstant.from_samples(time, command)
+    y = response(TransferFunction.sopdt(1.0, (1.0, 0.14), 0.0), time, u)
+    y -= 3.0 * (1.0 - np.exp(-np.maximum(time - 2.0, 0.0) / 10.0))
+    y += 0.006 * np.random.default_rng(0).standard_normal(time.size)
+    found = analyse(Record(time, y, command), alone=True)
+    assert found.model.model.process_sign == 1 or found.model.opposed > 0.5
+
+
+@pytest.mark.nightly
 def test_half_a_period_more_of_dead_time_is_no_other_direction():
     """The first answers came late, for which a model of the wrong sign had been trusted."""
     rng = np.random.default_rng(3)

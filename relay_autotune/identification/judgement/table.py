@@ -180,7 +180,7 @@ MODEL_CHECKS = (
         name="direction",
         title="Direction",
         what="largest share of models of the other direction that the record, or a part of it, "
-        "allows; or how well one that answers within the dead time explains as much; or, in a "
+        "allows; or how well one that answers before the model does explains as much; or, in a "
         "closed loop, how clearly a growing one explains more",
         unit="",
         doubtful=0.5,

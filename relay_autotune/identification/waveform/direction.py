@@ -38,12 +38,14 @@ def opposed(context: FitContext, fit: Fit) -> float:
     assert model is not None
     beside = replace(with_terms_of(fit.problem, context.problem), structure=FOPDT, colour=None)
     inside = replace(context, problem=beside)
-    found = _answered_earlier(inside, fit, model) if model.dead_time > 0.0 else 0.0
+    # Until an inverse response turns, it is an answer of the other direction.
+    turns = model.dead_time - sum(z.real for z in model.zeros if z.real < 0.0)
+    found = _answered_earlier(inside, fit, turns, -model.process_sign) if turns > 0.0 else 0.0
     return max(found, _outgrown(inside, fit, model)) if context.bounded else found
 
 
-def _answered_earlier(context: FitContext, fit: Fit, model: TransferFunction) -> float:
-    """Return how well a plain model that answers within the dead time of a fit explains as much.
+def _answered_earlier(context: FitContext, fit: Fit, turns: float, sign: int) -> float:
+    """Return how well a plain model that answers before a fit does explains as much.
 
     To a command that is nearly periodic, a process and its reverse half a period later answer
     alike. A short stretch, in which something else moved the measurement, may decide for the
@@ -51,17 +53,18 @@ def _answered_earlier(context: FitContext, fit: Fit, model: TransferFunction) ->
 
     :param context: the samples, and the terms beside the model.
     :param fit: of some of them.
-    :param model: of the fit, with a dead time.
+    :param turns: when the fit answers in its direction, after dead time and inverse response [s].
+    :param sign: the other direction, 1 or -1.
     :return: the smaller of two ratios, of the fit's error over the other's and of what the other
         explains over what the fit does; 0 where there is none.
     """
-    context = replace(context, problem=replace(context.problem, latest=model.dead_time))
+    context = replace(context, problem=replace(context.problem, latest=turns))
     own, total = _typical_squares(fit)
     least = min(
         (
             _typical_squares(c)[0]
-            for c in context.best_of_direction(-model.process_sign)
-            if c.model.response_time < model.dead_time
+            for c in context.best_of_direction(sign)
+            if c.model.response_time < turns
         ),
         default=math.inf,
     )
