@@ -194,7 +194,7 @@ def _of_pair(topics: Topics, wanted: Selection) -> tuple[list[Record], list[str]
             f"they are aligned by the recorder's clock"
         )
     units = {letter: topics.unit(name) for letter, name in zip("yu", names, strict=True)}
-    record = _in_units(join(signals[0], preceded(signals[1], wanted.command_before)), units)
+    record = _in_units(join(*signals, before=wanted.command_before), units)
     records, found = _taken_apart(record, whole=wanted.is_part)
     return records, [*notes, *found]
 
@@ -283,8 +283,9 @@ def _of_csv(path: Path, wanted: Selection) -> tuple[list[Record], list[str]]:
         if number and wanted.command_before is not None:
             notes.append("--command-before was used for the first recording in the file alone")
         try:
-            command = preceded(log.command, None if number else wanted.command_before)
-            record = _in_units(join(log.measurement, command, dated=log.dated), log.units)
+            before = None if number else wanted.command_before
+            record = join(log.measurement, log.command, before=before, dated=log.dated)
+            record = _in_units(record, log.units)
             if len(log.command) != len(log.measurement):
                 unseen = max(record.unseen, _between_readings(log.command))
                 record = replace(record, unseen=unseen)
@@ -436,19 +437,9 @@ def _cycle_start(cycles: Sequence[Any], taken: IntArray) -> tuple[int, ...]:
     return ()
 
 
-def preceded(command: Signal, before: float | None) -> Signal:
-    """Return a command with the level that held before its first value.
-
-    :param command: the command.
-    :param before: the level; None: it is not known.
-    """
-    if before is None or not len(command):
-        return command
-    time_ns = np.concatenate((command.time_ns[:1], command.time_ns))
-    return replace(command, time_ns=time_ns, values=np.append(before, command.values))
-
-
-def join(measurement: Signal, command: Signal, *, dated: bool = True) -> Record:
+def join(
+    measurement: Signal, command: Signal, *, before: float | None = None, dated: bool = True
+) -> Record:
     """Return the record of a loop of which measurement and command were recorded.
 
     ``command[i]`` is the level in force when sample ``i + 1`` is taken. Where commands came more
@@ -457,12 +448,13 @@ def join(measurement: Signal, command: Signal, *, dated: bool = True) -> Record:
 
     :param measurement: what the loop measured.
     :param command: what it commanded; each value holds until the next.
+    :param before: the command that held before its first value; None: it is not known.
     :param dated: whether the times are since the epoch.
     :raises BagError: if one of them is empty, constant, not finite or absurdly large, or they
         do not overlap.
     """
     _check(measurement, "measurement")
-    _check(command, "command")
+    _check(command, "command", before)
     t, y = measurement.time_ns, measurement.values
     c, u = command.time_ns, command.values
     # The last sample before the first command is kept: it is the one that command answers.
@@ -473,7 +465,7 @@ def join(measurement: Signal, command: Signal, *, dated: bool = True) -> Record:
             f"the command {command.name} begins {(c[0] - t[-1]) / 1e9:g} s after the last "
             f"sample of {measurement.name}; expected recordings of the same time"
         )
-    if c[-1] < t[0] and not bool(np.any(np.diff(u) != 0.0)):
+    if c[-1] < t[0] and _never_changes(command, before):
         raise BagError(f"the command {command.name} ends before {measurement.name} begins")
     # The level that holds at the end of each sample's interval, and when it was commanded.
     last = np.searchsorted(c, t[1:], side="left") - 1
@@ -487,7 +479,7 @@ def join(measurement: Signal, command: Signal, *, dated: bool = True) -> Record:
         command_time=_seconds(sent, origin),
         start=start_seconds(origin) if dated else 0.0,
     )
-    exact = PiecewiseConstant.from_samples(_seconds(c, origin), u)
+    exact = PiecewiseConstant.from_samples(_seconds(c, origin), u, before)
     seen = record.input()
     if not (
         seen.initial == exact.initial
@@ -526,7 +518,11 @@ def window(record: Record, start: float | None, end: float | None) -> list[Recor
     return [piece for piece in long if np.ptp(piece.command) > 0.0] or long[:1]
 
 
-def _check(signal: Signal, role: str) -> None:
+def _never_changes(signal: Signal, before: float | None) -> bool:
+    return before in (None, signal.values[0]) and bool(np.all(signal.values == signal.values[0]))
+
+
+def _check(signal: Signal, role: str, before: float | None = None) -> None:
     name = role if signal.name == role else f"{role} {signal.name}"
     if len(signal) == 0:
         raise BagError(f"the {name} holds no value")
@@ -540,7 +536,7 @@ def _check(signal: Signal, role: str) -> None:
             f"{LARGEST_VALUE:g}, which no quantity is); leave such a stretch out of the "
             f"recording"
         )
-    if bool(np.all(signal.values == signal.values[0])):
+    if _never_changes(signal, before):
         what, remedy = "is constant", ""
         if role == "command":
             what = "never changes"

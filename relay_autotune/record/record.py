@@ -233,19 +233,26 @@ class PiecewiseConstant:
         object.__setattr__(self, "values", values)
 
     @classmethod
-    def from_samples(cls, times: FloatArray, values: FloatArray) -> PiecewiseConstant:
+    def from_samples(
+        cls, times: FloatArray, values: FloatArray, before: float | None = None
+    ) -> PiecewiseConstant:
         """Keep the changes of a held signal given by all its samples.
 
         :param times: instants of the samples, not decreasing [s], shape (n,), n >= 1; of equal
             instants the last one counts.
         :param values: the level from each instant on, shape (n,).
+        :param before: the level before the first instant, which counts as one of change even
+            where it is the same; None: not known.
         """
         times = np.asarray(times, dtype=np.float64)
         values = np.asarray(values, dtype=np.float64)
         last, initial = np.append(np.diff(times) > 0.0, True), float(values[0])
         times, values = times[last], values[last]
+        if before is not None:
+            initial = before
         # A change at the first instant of all is known by two values there.
-        changed = np.flatnonzero(np.diff(values, prepend=initial) != 0.0)
+        changed = np.diff(values, prepend=initial) != 0.0
+        changed[0] |= before is not None
         return cls(times[changed], values[changed], initial)
 
     @property

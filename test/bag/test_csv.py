@@ -640,6 +640,12 @@ def test_a_step_before_the_first_row_needs_the_command_before_it(tmp_path):
     (record,) = read_experiments(path, Selection(command_before=0.0)).experiments
     held = record.input()
     assert (held.initial, held.times.tolist(), held.values.tolist()) == (0.0, [0.0], [10.0])
+    # One that it goes on with is known to have held before the first row.
+    then = text + "3.00,20,1500.00\n"
+    selection = Selection(command_before=10.0)
+    (record,) = read_experiments(write(tmp_path / "c.csv", then), selection).experiments
+    held = record.input()
+    assert (held.initial, held.times[0], held.values.tolist()) == (10.0, 0.0, [10.0, 20.0])
     # Before the next one it was what it was in this one, or nobody knows.
     back = "".join(f"{a:.2f},-10,{1000.0 - b:.2f}\n" for a, b in zip(t, speed, strict=True))
     found = read_experiments(write(tmp_path / "b.csv", text + back), Selection(command_before=0.0))

@@ -357,7 +357,7 @@ def _warnings(
     if moved and records[0].settings is None:
         found.append(
             "the process moved when the record began, which was fitted with the model: where it "
-            "had rested under another command, give that as --command-before"
+            "had rested, give the command of that rest as --command-before"
         )
     if _began_away(records, fit):
         found.append(
