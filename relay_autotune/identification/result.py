@@ -124,16 +124,20 @@ class Part:
     :param end: its last time [s].
     :param models: drawn from their posterior, each as likely as the others.
     :param contradicts: True: the part excludes the model of the whole record.
+    :param record: number of the record that it is, from 1, where several were fitted together.
     """
 
     begin: float
     end: float
     models: tuple[TransferFunction, ...]
     contradicts: bool = True
+    record: int = 0
 
     @property
     def span(self) -> str:
-        """Its times as text."""
+        """Which part it is, as text."""
+        if self.record:
+            return f"record {self.record}"
         return f"{self.begin:.4g} s to {self.end:.4g} s"
 
     def share_against(self, model: TransferFunction) -> float:

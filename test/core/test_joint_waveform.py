@@ -16,8 +16,10 @@ from relay_autotune.analysis import analyse_jointly
 from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.known import Known
 from relay_autotune.identification.methods import identify_jointly
+from relay_autotune.loop.analysis import analyse_loop
+from relay_autotune.process.response import response
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import Outcome, Record, RelaySettings
+from relay_autotune.record.record import Outcome, PiecewiseConstant, Record, RelaySettings
 
 pytestmark = pytest.mark.long
 
@@ -113,3 +115,30 @@ def test_a_joint_model_gets_gains():
     analysis = analyse_jointly(records, method="waveform", known=FOPDT)
     assert analysis.model is not None
     assert analysis.best_gains is not None
+
+
+def _pulsed(gain: float, dead_time: float, seed: int) -> Record:
+    time = np.arange(0.0, 120.0, 0.2)
+    u = PiecewiseConstant(np.array([10.0, 60.0, 80.0]), np.array([1.0, 0.0, 0.5]), 0.0)
+    y = response(TransferFunction.fopdt(gain, 5.0, dead_time), time, u)
+    y += 0.04 * np.random.default_rng(seed).standard_normal(time.size)
+    return Record(time, y, u(time), held_input=u)
+
+
+@pytest.mark.parametrize(("gain", "dead_time"), [(2.0, 2.0), (2.0, 5.0), (4.0, 1.0)])
+def test_gains_hold_on_the_processes_of_all_records(gain, dead_time):
+    """Of two dead times, one model in the middle had been trusted, whatever they were."""
+    records = [_pulsed(2.0, 1.0, 0), _pulsed(gain, dead_time, 1)]
+    alike = analyse_jointly([records[0], _pulsed(2.0, 1.0, 1)])
+    found = analyse_jointly(records)
+    assert not any("two records" in each for each in alike.model.warnings)
+    assert any("two records give models that differ" in each for each in found.model.warnings)
+    for process in (2.0, 1.0), (gain, dead_time):
+        truth = TransferFunction.fopdt(process[0], 5.0, process[1])
+        assert analyse_loop(found.best_gains, truth).ms < 1.75
+
+
+def test_records_of_opposite_directions_are_refused(recwarn):
+    with pytest.raises(IdentificationError, match="records 1 and 2 go in opposite directions"):
+        identify_jointly([_pulsed(2.0, 1.0, 0), _pulsed(-2.0, 1.0, 1)], "waveform")
+    assert not recwarn.list

@@ -129,7 +129,8 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
     apart = f"{math.sqrt(allowed.temper):.2g}"
     if float(apart) > 1.0:
         warning = (
-            f"two parts of the record give models that differ {apart} times "
+            f"two {'records' if len(records) > 1 else 'parts of the record'} give models that "
+            f"differ {apart} times "
             "as much as their noise explains: the process, its load or its operating point "
             "changed; intervals are widened to hold both, and gains have to hold on both"
         )

@@ -38,6 +38,7 @@ from relay_autotune.identification.waveform.separable import (
 )
 from relay_autotune.process.structures import Structure
 from relay_autotune.process.transfer_function import TransferFunction
+from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.moves import changes_within
 from relay_autotune.record.record import PiecewiseConstant
 
@@ -78,13 +79,13 @@ class Posterior:
     """The models that a record allows.
 
     :param models: drawn from the mixture over all candidates, each as likely as the others, and
-        what gains have to hold on besides: either side of an unequal process, both parts of one
+        what gains have to hold on besides: either side of an unequal process, all parts of one
         that changed, a plain model beside one in colour.
     :param mixture: those of the candidates alone.
     :param values: of the chosen structure's parameters in its own draws, shape (k, p).
     :param own: the models of these.
     :param parts: those of each part alone; empty where a part holds too little.
-    :param temper: mean square of the difference of the parts over that by chance, at least 1:
+    :param temper: mean square of the difference of two parts over that by chance, at least 1:
         the ratio by which the record's variances are larger than its noise alone explains.
     """
 
@@ -123,7 +124,7 @@ def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: fl
     mixture = [*rest, *mixture]
     models = [*_on_both_sides(rest, fit.problem, fit.state), *models]
     if temper > 1.0:
-        # The process changed from one part to the other: both are among the models.
+        # The process changed from one part to the other: all are among the models.
         models += [m for part in parts for m in part.models[:_SHARE]]
     models += [m for m in _plain_models(fit) for _ in range(_SHARE)]
     return Posterior(tuple(models), tuple(mixture), own.values, own.models, parts, temper)
@@ -184,19 +185,47 @@ def _draws(
 def _parts(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part, ...]:
     """Return the models that each part of a record allows in the chosen structure.
 
-    They meet where the command first has its full reach: an actuator at its end, or a process that
-    is not linear, answers large moves otherwise than small ones. Where one of them would tell
-    little, they hold equal information on the parameters. Each has its own offset, and a free
-    initial state where the whole record has one or the command moved before. One that its own
-    models do not explain, such as a rest after all responses, tells nothing.
+    Of several records each is a part. One that its own models do not explain, such as a rest after
+    all responses, tells nothing.
     """
     problem, state = fit.problem, fit.state
-    if len(problem.bounds) > 1 or problem.structure.unstable:
+    if problem.structure.unstable:
         return ()
     if problem.colour is None:
         problem = problem.thinned(_MOST_OF_PARTS)
     gain = state.coefficients[: len(problem.structure.powers)]
-    jacobian = _slopes(problem, gain, state.theta)
+    several = len(problem.bounds) > 1
+    parts = []
+    for number, part in enumerate(problem.each() if several else _halves(problem, state), 1):
+        if part.relaxation and not changes_within(part.inputs[0], part.time).size:
+            # It moves freely, and a response of either direction fits what that leaves.
+            continue
+        degrees = max(part.time.size - evaluate(part, state.theta).parameters, 1)
+
+        def variance_of(left: FloatArray, degrees: int = degrees) -> float:
+            return inflation * float(left @ left) / degrees
+
+        found = _allowed(
+            part, gain, state.theta, fit.scale, variance_of, _DRAWS_OF_PART, rng, apart=several
+        )
+        if found.models and found.explains:
+            ends = float(part.time[0]), float(part.time[-1])
+            parts.append(Part(*ends, found.models, found.excludes_known, number * several))
+    return tuple(parts)
+
+
+def _halves(problem: Problem, state: Trial) -> tuple[Problem, ...]:
+    """Return two parts of a record; none where one would hold too little.
+
+    They meet where the command first has its full reach: an actuator at its end, or a process that
+    is not linear, answers large moves otherwise than small ones. Where one of them would tell
+    little, they hold equal information on the parameters. Each has its own offset, and a free
+    initial state where the whole record has one or the command moved before.
+
+    :param problem: of the record.
+    :param state: its fit.
+    """
+    jacobian = _slopes(problem, state.coefficients[: len(problem.structure.powers)], state.theta)
     size = np.einsum("pn,pn->p", jacobian, jacobian)
     size[size == 0.0] = 1.0
     information = np.cumsum(np.sum(jacobian**2 / size[:, None], axis=0))
@@ -209,21 +238,7 @@ def _parts(fit: Fit, inflation: float, rng: np.random.Generator) -> tuple[Part, 
     if changes_within(problem.inputs[0], first.time).size:
         # The free state of an integrator is the offset.
         second = replace(second, relaxation=bool(problem.structure.factors))
-    parts = []
-    for part in (first, second):
-        if part.relaxation and not changes_within(part.inputs[0], part.time).size:
-            # It moves freely, and a response of either direction fits what that leaves.
-            continue
-        degrees = max(part.time.size - evaluate(part, state.theta).parameters, 1)
-
-        def variance_of(left: FloatArray, degrees: int = degrees) -> float:
-            return inflation * float(left @ left) / degrees
-
-        found = _allowed(part, gain, state.theta, fit.scale, variance_of, _DRAWS_OF_PART, rng)
-        if found.models and found.explains:
-            ends = float(part.time[0]), float(part.time[-1])
-            parts.append(Part(*ends, found.models, found.excludes_known))
-    return tuple(parts)
+    return first, second
 
 
 def _full_reach(problem: Problem) -> int:
@@ -240,23 +255,26 @@ def _difference_of_parts(parts: Sequence[Part], frequency: float) -> float:
 
     With d the difference of the mean logarithms of their responses at one frequency, as real and
     imaginary part, and C the sum of their covariances, it is ``d' C^-1 d/2``: 1 on average for one
-    process.
+    process. Of several parts the largest one counts. Records may be of different processes, of
+    which the slowest one's loop is meant.
     """
-    if len(parts) < 2 or any(len(part.models) < 2 for part in parts):
-        return 0.0
+    if any(part.record for part in parts):
+        ends = (ultimate_point(part.models[0]) for part in parts)
+        frequency = min([frequency, *(end.frequency for end in ends if end is not None)])
     found = []
     for part in parts:
         at = np.array([complex(m(1j * frequency)) for m in part.models])
         logs = np.log(at / at[0]) + np.log(at[0])
-        found.append(np.stack((logs.real, logs.imag)))
-    difference = found[0].mean(axis=1) - found[1].mean(axis=1)
-    difference[1] = (difference[1] + math.pi) % (2.0 * math.pi) - math.pi
-    first, second = (np.cov(logs) for logs in found)
-    if not max(first[0, 0], second[0, 0]) < _LOGARITHM**2:
-        # A part that knows the gain no better than the prior does tells nothing.
-        return 0.0
-    covariance = first + second
-    return 0.5 * float(difference @ np.linalg.pinv(covariance, hermitian=True) @ difference)
+        # One that knows the gain no better than the prior does tells nothing.
+        if at.size > 1 and np.var(logs.real, ddof=1) < _LOGARITHM**2:
+            found.append(np.stack((logs.real, logs.imag)))
+    largest = 0.0
+    for one, other in itertools.combinations(found, 2):
+        difference = one.mean(axis=1) - other.mean(axis=1)
+        difference[1] = (difference[1] + math.pi) % (2.0 * math.pi) - math.pi
+        inverse = np.linalg.pinv(np.cov(one) + np.cov(other), hermitian=True)
+        largest = max(largest, 0.5 * float(difference @ inverse @ difference))
+    return largest
 
 
 @dataclass(frozen=True)
@@ -422,6 +440,8 @@ def _allowed(
     noise: Callable[[FloatArray], float],
     count: int,
     rng: np.random.Generator,
+    *,
+    apart: bool = False,
 ) -> _Drawn:
     """Return draws from the posterior that some samples give, and if it excludes the known.
 
@@ -432,6 +452,7 @@ def _allowed(
     :param noise: variance of the noise that a residual shows.
     :param count: models to draw.
     :param rng: the source.
+    :param apart: True: the samples are of a test of their own.
     """
     structure, k = problem.structure, gain.size
     slow = float(unit_steps(structure, theta)[-1])
@@ -444,10 +465,13 @@ def _allowed(
     start = density.about(centre, math.copysign(1.0, gain[0]))
     places = [start]
     # The best fit without the prior may be nearer, but also run off where samples tell little.
-    own = refine(problem, theta, tolerance=TRIAL, most=_STEPS)
-    if own.coefficients[0] != 0.0:
-        at = _point_of(own.coefficients[:k], own.theta)
-        places.append(density.about(at, math.copysign(1.0, own.coefficients[0])))
+    # That of one of several records may be far away, behind fits to its noise.
+    for later in (0.0, 0.5, 1.0) if apart else (0.0,):
+        near = np.append(theta[:-1], theta[-1] + later * slow)
+        own = refine(problem, near, tolerance=TRIAL, most=_STEPS)
+        if own.coefficients[0] != 0.0:
+            at = _point_of(own.coefficients[:k], own.theta)
+            places.append(density.about(at, math.copysign(1.0, own.coefficients[0])))
     modes = [density.most_likely(place) for place in places]
     variance = min(mode.variance for mode in modes)
     here = max(modes, key=lambda mode: density.log_mass(mode, variance))

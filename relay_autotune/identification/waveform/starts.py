@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from relay_autotune.arrays import FloatArray
+from relay_autotune.errors import IdentificationError
 from relay_autotune.identification.waveform.problem import (
     NEGLIGIBLE,
     Problem,
@@ -148,12 +149,20 @@ def latest_dead_times(problem: Problem, sign: int) -> tuple[float, float]:
     :param problem: the problem.
     :param sign: the direction in which a relay worked, 1 or -1; 0: not known.
     :return: minus infinity for a direction that the relay or the first response rules out.
+    :raises IdentificationError: if the records rule out both.
     """
     if sign:
         return (-math.inf, math.inf) if sign > 0 else (math.inf, -math.inf)
     parts = zip(problem.experiments, problem.inputs, strict=True)
     found = (first_response(problem.time[part], problem.y[part], u) for part, u in parts)
-    below, above = map(min, zip(*found, strict=True))
+    each = list(zip(*found, strict=True))
+    below, above = map(min, each)
+    if max(below, above) < 0.0:
+        one, other = sorted(1 + direction.index(-math.inf) for direction in each)
+        raise IdentificationError(
+            f"the first answers of records {one} and {other} go in opposite directions, and no "
+            "model explains both: check their columns and signs, or take them one by one"
+        )
     return below, above
 
 
