@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from relay_autotune.identification.limit_cycle.fourier import FrequencyPoint
 from relay_autotune.process.transfer_function import TransferFunction, process_text
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.quantities import NORMAL_95, result_field, result_fields
+from relay_autotune.record.record import Input, PiecewiseConstant
 from relay_autotune.text import percent
 
 # Largest half interval of a determined value, relative to the value.
@@ -241,6 +242,8 @@ class Identification:
     middle: float = math.nan
     # Lowest and highest command that the actuator was found to follow [u].
     ends: tuple[float, float] = (-math.inf, math.inf)
+    # Fastest change of the command that was found to be followed [u/s].
+    rate: float = math.inf
     # True: the process was not at rest at the relay's baseline when the test began.
     began_away: bool = False
     # True: a move of the command just before the record was estimated with the model.
@@ -280,6 +283,15 @@ class Identification:
             return command
         away = command - self.middle
         return np.asarray(self.middle + np.where(away > 0.0, *self.effects) * away)
+
+    def felt_input(self, u: PiecewiseConstant) -> Input:
+        """Return a held command as the model feels it.
+
+        :param u: the command.
+        """
+        levels = self.felt(u.levels)
+        held = replace(u, values=levels[1:], initial=float(levels[0]))
+        return held.slewed(self.rate) if math.isfinite(self.rate) else held
 
     @property
     def why_chosen(self) -> str:

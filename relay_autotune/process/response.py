@@ -34,7 +34,7 @@ from scipy.linalg.lapack import dtbtrs, ztbtrs
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import ModelError
 from relay_autotune.process.transfer_function import TransferFunction
-from relay_autotune.record.record import PiecewiseConstant
+from relay_autotune.record.record import Input, PiecewiseConstant
 
 # Real where poles are real, complex for the upper one of a pair.
 Coordinates = NDArray[Any]
@@ -371,7 +371,7 @@ def _is_upper(group: list[complex]) -> bool:
     return all(e.imag > 0.0 for e in group)
 
 
-def response(model: TransferFunction, time: ArrayLike, u: PiecewiseConstant) -> FloatArray:
+def response(model: TransferFunction, time: ArrayLike, u: Input) -> FloatArray:
     """Return the output's deviation from rest, exact for any real dead time.
 
     The process rests at ``u.initial`` before the first change of the input (an integrating
@@ -385,12 +385,18 @@ def response(model: TransferFunction, time: ArrayLike, u: PiecewiseConstant) -> 
     """
     t = np.asarray(time, dtype=np.float64)
     flat = t.ravel()
+    if isinstance(u, PiecewiseConstant):
+        steps = np.diff(u.levels)
+    else:
+        # A ramp is a step that is integrated once more.
+        steps = np.diff(u.slopes, prepend=0.0)
+        model = replace(model, integrators=model.integrators + 1)
     changes = u.times + model.dead_time
     if changes.size == 0 or flat.size == 0:
         return np.zeros(t.shape)
     end = max(float(flat.max()), float(changes[-1]))
     modes = Modes.of(model, horizon=max(end - float(changes[0]), np.finfo(float).tiny))
-    states = modes.states(changes, np.diff(u.levels))
+    states = modes.states(changes, steps)
     segment = np.searchsorted(changes, flat, side="right") - 1
     after = segment >= 0
     y = np.zeros(flat.shape)

@@ -264,6 +264,27 @@ class PiecewiseConstant:
         """Return the level in force at each time ``t`` [s], any shape."""
         return self.levels[np.searchsorted(self.times, t, side="right")]
 
+    def slewed(self, rate: float) -> PiecewiseLinear:
+        """Return what follows this signal no faster than at some rate.
+
+        :param rate: per second.
+        """
+        times, slopes, level = [], [], self.initial
+        following = np.append(self.times[1:], np.inf).tolist()
+        for time, target, then in zip(
+            self.times.tolist(), self.values.tolist(), following, strict=True
+        ):
+            slope = math.copysign(rate, target - level)
+            arrives = time + (target - level) / slope
+            times.append(time)
+            slopes.append(slope)
+            if arrives < then:
+                times.append(arrives)
+                slopes.append(0.0)
+            level = target if arrives < then else level + slope * (then - time)
+        distinct = np.append(np.diff(times) > 0.0, True)[: len(times)]
+        return PiecewiseLinear(np.array(times)[distinct], np.array(slopes)[distinct], self.initial)
+
 
 @dataclass(frozen=True)
 class PiecewiseLinear:

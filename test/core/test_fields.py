@@ -62,6 +62,7 @@ UNTOLD = {
             "to_explain",
             "parts",
             "opposed",
+            "rate",
             "plain",
         )
     ),

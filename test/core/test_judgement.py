@@ -249,9 +249,9 @@ def test_a_part_that_begins_at_rest_has_no_free_state(monkeypatch, at):
     """With one, a step at its begin would be explained with a gain of any sign."""
     parts, drawn = [], posterior._allowed
 
-    def noted(problem, *args):
+    def noted(problem, *args, **options):
         parts.append(problem)
-        return drawn(problem, *args)
+        return drawn(problem, *args, **options)
 
     monkeypatch.setattr(posterior, "_allowed", noted)
     time = np.arange(0.0, 300.0, 0.5)
@@ -266,9 +266,9 @@ def test_a_part_that_moves_freely_is_asked_for_no_models(monkeypatch):
     """Those of an incubator that cooled after its pulses were of either direction."""
     begins, drawn = [], posterior._allowed
 
-    def noted(problem, *args):
+    def noted(problem, *args, **options):
         begins.append(problem.time[0])
-        return drawn(problem, *args)
+        return drawn(problem, *args, **options)
 
     monkeypatch.setattr(posterior, "_allowed", noted)
     time = np.arange(0.0, 300.0, 0.5)

@@ -158,8 +158,7 @@ def _difference(found: Identification, record: Record) -> Difference | None:
     u = record.input()
     few = np.unique(np.linspace(0, len(record) - 1, _MOST_COMPARED).astype(np.int64))
     time = record.time[few]
-    felt = found.felt(u.levels)
-    answer = response(model, time, replace(u, values=felt[1:], initial=float(felt[0])))
+    answer = response(model, time, found.felt_input(u))
     # The measurement's zero and the command before the record are not known.
     before = response(model, time, PiecewiseConstant(time[:1], np.ones(1), 0.0))
     beside = [np.ones(time.size), before]

@@ -11,9 +11,9 @@ that colour, and the priors of the table below.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -51,6 +51,7 @@ from relay_autotune.identification.waveform.starts import (
     is_unobservable,
     latest_dead_times,
     likeliest_ends,
+    likeliest_rate,
     multistart,
     shifted_columns,
     start_fopdt,
@@ -73,20 +74,23 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.record.moves import (
     MOST_GROWTH,
     begins_with_only_move,
+    changes_within,
     is_controlled,
     longest_push,
     longest_stay,
+    moves_always,
 )
-from relay_autotune.record.record import Input
+from relay_autotune.record.record import Input, PiecewiseConstant
 
 MOST_LAGS = 8
 _MOST_LAGS_WITH_ZERO = 4
 _SAMPLES_EACH = 8
 # Gains have to hold on the models of these, too.
 PLAIN = (FOPDT.name, SOPDT.name)
-# What was before the record, and with the ends that for which a dead time or a lag can stand.
+# What was before the record, and with an actuator's limits that for which a dead time or a lag can
+# stand.
 _BEFORE = frozenset(("drift", "relaxation", "past"))
-_HIDDEN = _BEFORE | {"ends"}
+_HIDDEN = _BEFORE | {"ends", "rate"}
 # Steps of a fit with a further term or in another colour, and how often a load and ends are moved.
 _STEPS, _MOVES = 15, 4
 # Dead time on either side of a zero at 0, as a share of all times together.
@@ -156,6 +160,7 @@ class FitContext:
     :param bounded: True: a relay or a controller held the process, so that it may grow.
     :param latest: as of :func:`latest_dead_times`.
     :param loads: True: a step of the load may be estimated.
+    :param rate: returns the fastest change of the command that may be followed [u/s]; None: any.
     :param closest: of all candidates in white noise, the one of each direction that leaves least.
     """
 
@@ -166,6 +171,7 @@ class FitContext:
     bounded: bool
     latest: tuple[float, float]
     loads: bool
+    rate: Callable[[], float | None]
     _fits: dict[tuple[object, ...], Trial] = field(default_factory=dict, repr=False)
     closest: dict[int, Candidate] = field(default_factory=dict, repr=False)
     _growing: dict[str, list[FloatArray]] = field(default_factory=dict, repr=False)
@@ -188,7 +194,8 @@ class FitContext:
         )
         latest = latest_dead_times(problem, sign)
         few = problem.thinned(most) if most else problem
-        return cls(few, _first_fopdt(few, sign), sign, held, bounded, latest, loads=held)
+        rate = cache(lambda: likeliest_rate(problem))
+        return cls(few, _first_fopdt(few, sign), sign, held, bounded, latest, held, rate)
 
     def with_samples(self, problem: Problem) -> FitContext:
         """Return the context with other samples of the same record, of which nothing is fitted.
@@ -303,8 +310,8 @@ class FitContext:
 
     def _score(self, problem: Problem, state: Trial, model: TransferFunction) -> float:
         n = problem.time.size
-        # The instant of a load is estimated, too.
-        count = state.parameters + (problem.load is not None)
+        # The instant of a load and the rate are estimated, too.
+        count = state.parameters + (problem.load is not None) + (problem.rate is not None)
         score = information_criterion(state.cost, n, count, self.floor)
         score += colour_cost(problem.colour, n)
         imitations = sum(nuisances_of(problem))
@@ -351,6 +358,10 @@ class FitContext:
         if "ends" in terms:
             changed["ends"] = self.ends
             if self.ends is None:
+                return []
+        if "rate" in terms:
+            changed["rate"] = self.rate()
+            if self.rate() is None:
                 return []
         if "load" in terms:
             changed["load"] = likeliest_load(candidate.problem, candidate.state)
@@ -442,6 +453,14 @@ class FitContext:
             "play": self.problem.most_play(held=self.held) >= self.problem.least_command,
             "load": self.loads and len(self.problem.bounds) == 1,
             "ends": not self.held and self.problem.shows_its_curve,
+            # The shape of one answer shows lags as well.
+            "rate": not self.bounded
+            and all(
+                isinstance(u, PiecewiseConstant)
+                and not moves_always(time, u)
+                and changes_within(u, time).size > 1
+                for time, u in self._parts
+            ),
             "friction": self.held and bool(self.problem.motions),
         }
         each: list[tuple[str, ...]] = [(term,) for term in TERMS if needed[term]]
@@ -594,7 +613,7 @@ def _first_fopdt(problem: Problem, sign: int) -> Trial:
 def _key_of_fit(problem: Problem) -> tuple[object, ...]:
     """Return what tells the fits of one context apart, whose structures have no zero."""
     # The samples of a first dead time may have been dropped.
-    terms = problem.load, problem.ends, *nuisances_of(problem)
+    terms = problem.load, problem.ends, problem.rate, *nuisances_of(problem)
     return problem.structure.denominator, problem.time.size, *terms
 
 

@@ -47,6 +47,7 @@ from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.moves import only_move
 from relay_autotune.record.record import Record
+from relay_autotune.text import digits
 
 _UNEXPLAINED = 1.5
 _WORTH_TELLING = 1e-3
@@ -119,6 +120,7 @@ def report(records: Sequence[Record], fit: Fit) -> Identification:
         effects=problem.effects(state.coefficients),
         middle=middle_of(problem.inputs[0]) if problem.unequal else math.nan,
         ends=problem.ends_of(state.coefficients),
+        rate=problem.rate or math.inf,
         began_away=_began_away(records, fit),
         moved_before=problem.past,
         loaded=problem.load is not None,
@@ -340,6 +342,11 @@ def _warnings(
         found.append(
             f"dry friction of {friction:.3g} u was estimated with the model: gains are for the "
             "motion, and a rest may stay off the set-point by what that command cannot move"
+        )
+    if fit.problem.rate is not None:
+        found.append(
+            f"no change of the command is followed faster than {digits(fit.problem.rate, 3)} u/s, "
+            "which was estimated with the model: gains are for smaller moves"
         )
     if fit.problem.load is not None:
         size = fit.problem.relative("load", fit.state.coefficients)

@@ -25,7 +25,7 @@ from relay_autotune.errors import ModelError
 from relay_autotune.identification.result import Part
 from relay_autotune.identification.waveform.candidates import PLAIN
 from relay_autotune.identification.waveform.fit_covariance import Fit
-from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem
+from relay_autotune.identification.waveform.problem import NEGLIGIBLE, Problem, without
 from relay_autotune.identification.waveform.rational import unit_steps
 from relay_autotune.identification.waveform.separable import (
     TRIAL,
@@ -36,7 +36,8 @@ from relay_autotune.identification.waveform.separable import (
     residual_of_model,
     rms_in_simulation,
 )
-from relay_autotune.process.structures import Structure
+from relay_autotune.identification.waveform.starts import Guess, best_of, start_fopdt
+from relay_autotune.process.structures import FOPDT, SOPDT, Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
 from relay_autotune.record.moves import changes_within
@@ -80,7 +81,7 @@ class Posterior:
 
     :param models: drawn from the mixture over all candidates, each as likely as the others, and
         what gains have to hold on besides: either side of an unequal process, all parts of one
-        that changed, a plain model beside one in colour.
+        that changed, a plain model beside one in colour, and what large moves show.
     :param mixture: those of the candidates alone.
     :param values: of the chosen structure's parameters in its own draws, shape (k, p).
     :param own: the models of these.
@@ -126,7 +127,7 @@ def posterior(fit: Fit, shares: Sequence[float], inflation: float, frequency: fl
     if temper > 1.0:
         # The process changed from one part to the other: all are among the models.
         models += [m for part in parts for m in part.models[:_SHARE]]
-    models += [m for m in _plain_models(fit) for _ in range(_SHARE)]
+    models += [m for m in (*_plain_models(fit), *_large_moves(fit)) for _ in range(_SHARE)]
     return Posterior(tuple(models), tuple(mixture), own.values, own.models, parts, temper)
 
 
@@ -156,6 +157,17 @@ def _plain_models(fit: Fit) -> list[TransferFunction]:
         if model is not None and math.sqrt(state.cost / state.residual.size) <= most:
             found.append(model)
     return found
+
+
+def _large_moves(fit: Fit) -> list[TransferFunction]:
+    """Return the model that large moves show, where none is followed faster than at some rate."""
+    if fit.problem.rate is None:
+        return []
+    first = without(replace(fit.problem, structure=FOPDT), ["rate"])
+    guess = Guess.of(first, best_of(first, start_fopdt(first)))
+    found = best_of(replace(first, structure=SOPDT), guess.starts(SOPDT))
+    model = SOPDT.model_at(found.theta, fit.scale * found.coefficients)
+    return [] if model is None else [model]
 
 
 def _largest_rms(fit: Fit, share: float = _AS_WELL) -> float:

@@ -26,7 +26,7 @@ NEGLIGIBLE = 1e-10
 # The fractional parts of its multiples are spread evenly, without a period (Weyl 1916).
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 # What may be estimated beside the model, as fields of a problem.
-TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "ends", "friction")
+TERMS = ("drift", "relaxation", "past", "unequal", "play", "load", "ends", "rate", "friction")
 # Range of a rest, in steps of the sensor, in which nothing moves.
 _A_STEP = 1.5
 # Instants at which a load is tried.
@@ -64,6 +64,7 @@ class Problem:
         shift of its time are estimated. None: none came.
     :param ends: lowest and highest command that the actuator follows [u]; small shifts of them are
         estimated. None: it follows all.
+    :param rate: the fastest change of a command that is followed [u/s]; None: any.
     :param friction: True: dry friction is estimated: a command against each motion, and what it
         takes of the command while the process stands still.
     :param motions: the direction in which the measurement moves, 1 or -1, and the command from
@@ -86,6 +87,7 @@ class Problem:
     play: bool = False
     load: float | None = None
     ends: tuple[float, float] | None = None
+    rate: float | None = None
     friction: bool = False
     motions: tuple[PiecewiseConstant, ...] = ()
     colour: Colour | None = None
@@ -381,7 +383,8 @@ class Problem:
         """
         each = zip(self.inputs, self.experiments, strict=True)
         return [
-            Inputs((_clipped(u, self.ends), *self._inputs_of_terms(u, part))) for u, part in each
+            Inputs((_followed(u, self.ends, self.rate), *self._inputs_of_terms(u, part)))
+            for u, part in each
         ]
 
     def _inputs_of_terms(self, u: Input, part: slice) -> Iterator[PiecewiseConstant]:
@@ -488,12 +491,15 @@ def _mapped(u: Input, of: Callable[[FloatArray], NDArray[Any]]) -> PiecewiseCons
     return PiecewiseConstant(u.times, values[1:] - values[0], 0.0)
 
 
-def _clipped(u: Input, ends: tuple[float, float] | None) -> Input:
+def _followed(u: Input, ends: tuple[float, float] | None, rate: float | None) -> Input:
     """Return what an actuator makes of a command.
 
     :param ends: as ``Problem.ends``.
+    :param rate: as ``Problem.rate``.
     """
-    return u if ends is None else _mapped(u, lambda x: np.clip(x, *ends))
+    if ends is not None:
+        u = _mapped(u, lambda x: np.clip(x, *ends))
+    return u.slewed(rate) if rate and isinstance(u, PiecewiseConstant) else u
 
 
 def is_above(u: Input, level: float) -> PiecewiseConstant:
@@ -569,7 +575,7 @@ def without(problem: Problem, terms: Iterable[str]) -> Problem:
     :param problem: any.
     :param terms: some of ``TERMS``.
     """
-    absent: dict[str, Any] = {t: None if t in ("load", "ends") else False for t in terms}
+    absent: dict[str, Any] = {t: None if t in ("load", "ends", "rate") else False for t in terms}
     return replace(problem, **absent)
 
 

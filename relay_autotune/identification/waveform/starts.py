@@ -11,9 +11,10 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from relay_autotune.arrays import FloatArray
 from relay_autotune.errors import IdentificationError
@@ -85,6 +86,9 @@ def is_unobservable(
 
 
 _GRID_SAMPLES = 240
+# Number of rates that are tried, and the lowest one's time over the longest dead time; to which
+# part the best one is known, and the largest share of the squares that it leaves.
+_RATES, _LONGER, _RATE_KNOWN, _LESS = 16, 4.0, 0.01, 0.8
 _BEST = 3
 _COARSE = 1e-4
 # Rounds of steps on few samples: largest number of steps, and how many starts take them.
@@ -383,6 +387,31 @@ def likeliest_ends(problem: Problem) -> tuple[float, float] | None:
     apart = (p for p in pairs if p[1] - p[0] > 1 or p[0] == 0 or p[1] > ENDS)
     low, high = min(apart, key=score)
     return (ends[low], ends[high]) if high - low <= ENDS else None
+
+
+def likeliest_rate(problem: Problem) -> float | None:
+    """Return the fastest change of a command that is followed, as few samples tell [u/s].
+
+    The process is a lag behind a dead time.
+
+    :param problem: of commands that are held, with a FOPDT structure.
+    :return: None: that any is followed explains about as much.
+    """
+    few, (shortest, longest) = coarse(problem), time_scales(problem)
+    # By which the command crosses its range in a sample, or in a few of the longest dead times.
+    rates = float(np.ptp(problem.levels)) / np.geomspace(_LONGER * longest, shortest, _RATES)
+    each = [replace(few, rate=rate) for rate in rates]
+    fits = [best_of(at, start_fopdt(at)) for at in each]
+    k = min(range(_RATES), key=lambda i: fits[i].cost)
+    if k in (0, _RATES - 1):
+        return None
+
+    def cost(log: float) -> float:
+        return refine(replace(few, rate=math.exp(log)), fits[k].theta, tolerance=TRIAL).cost
+
+    within = np.log((rates[k - 1], rates[k + 1]))
+    found = minimize_scalar(cost, bounds=within, method="bounded", options={"xatol": _RATE_KNOWN})
+    return math.exp(found.x) if found.fun < _LESS * best_of(few, start_fopdt(few)).cost else None
 
 
 def shifted_columns(
