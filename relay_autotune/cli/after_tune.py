@@ -416,7 +416,7 @@ class AfterTune(Tuned):
         :param against: what speaks against the gains; empty: nothing.
         """
         if why := self.loop.nodes.why_lost():
-            say(PROGRAM, f"{why}: the last command stays in force; see to the plant")
+            say(PROGRAM, f"{why}; {self.loop.client.left_behind()}")
             return
         then = (
             "do not start a controller with these gains, they are not proven"

@@ -97,7 +97,7 @@ class JointLoop(Loop):
         super().__init__(client(namespace_of_joint(loop.node, loop.joint), robot), options)
         # The reference is given back after that, and reported then.
         back = f"{loop.joint} gets back its controllers of before" if options.open else ""
-        self.client.left_behind = back
+        self.client.left_behind = lambda: back
         self._take_known()
         if not options.web:
             self.answers.ask(*self._questions())

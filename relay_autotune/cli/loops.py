@@ -354,6 +354,7 @@ class TopicLoop(Loop):
         with Working(f"looking who commands {command}"):
             self._require_alone()
         self._give_up = client.claim(self._commands.kind, command)
+        client.left_behind = self._left_behind
         if not options.web:
             answers.ask(*(SETTING[name] for name in self.form))
 
@@ -453,14 +454,29 @@ class TopicLoop(Loop):
         """The safe command in words."""
         return f"the safe command {self.options.at:.6g} u"
 
+    def _left_behind(self) -> str:
+        """Send the safe command in the place of a relay_node that is lost, and tell it."""
+        # One that hangs might command again.
+        self.nodes.end("relay_node")
+        self.client.send(self._commands.written(self.options.at), self.options.command)
+        return self._sent_to_nobody or f"{self.safe_command} was sent in its place"
+
+    @property
+    def _sent_to_nobody(self) -> str:
+        """What is said where nobody hears the safe command; empty: somebody does."""
+        topic = self.options.command
+        if self.client.is_taken(topic):
+            return ""
+        return (
+            f"{self.safe_command} was sent, but nobody takes commands from {topic} any more: see "
+            f"to the plant"
+        )
+
     def left(self) -> str:
         """Return at which command the loop is left, and whether that is the right one."""
-        command, topic = self.options.at, self.options.command
-        if not self.client.is_taken(topic):
-            return (
-                f"{self.safe_command} was sent, but nobody takes commands from {topic} any more: "
-                f"see to the plant"
-            )
+        command = self.options.at
+        if nobody := self._sent_to_nobody:
+            return nobody
         if left := super().left():
             return left
         if self._rests_elsewhere:

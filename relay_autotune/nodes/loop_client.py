@@ -38,6 +38,8 @@ _LISTEN = 1.0
 ANSWER_WITHIN, _ASK_AGAIN = 10.0, 3.0
 # Messages of a latched topic from before the subscription that are taken.
 _MOST_HEARD = 100
+# How long somebody who hears a topic may take to get a message [s].
+_HEARD_WITHIN = 2.0
 # Interval in which a message is published until it has arrived [s].
 _AGAIN = 0.2
 
@@ -477,6 +479,17 @@ class LoopClient:
         """
         mouth = self._node.create_publisher(kind, self._resolved(topic), quality.COMMAND)
         return lambda: self._node.destroy_publisher(mouth)
+
+    def send(self, message: Any, topic: str) -> None:
+        """Send a message, and wait until who hears the topic has it, for a few seconds at most.
+
+        :param message: of any type.
+        :param topic: its name.
+        """
+        mouth = self._node.create_publisher(type(message), self._resolved(topic), quality.COMMAND)
+        self._handle(lambda: mouth.get_subscription_count() > 0, _HEARD_WITHIN)
+        mouth.publish(message)
+        mouth.wait_for_all_acked(Duration(seconds=_HEARD_WITHIN))
 
     def _topic_of(self, relay: str, topic: str, type_name: str, *, published: bool) -> str:
         """Return the name that a topic of a relay_node has, which may be remapped.

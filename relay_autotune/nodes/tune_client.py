@@ -33,6 +33,8 @@ from relay_autotune_msgs.msg import RelayCycle, RelayExperiment
 # middleware's liveliness lease: on a busy machine a living one was missed for up to 1.4 s. One
 # whose process has ended is heard for a while, since its last messages may be on their way.
 _GONE, _LAST_WORDS = 3.0, 1.0
+# Time after which one whose process runs, and whose liveliness has ended, counts as hung [s].
+_HUNG = 10.0
 # How long messages are handled before the answer is looked for again [s].
 _TICK = 0.05
 # States of an ended goal; the safe command was sent before.
@@ -70,10 +72,10 @@ class TuneClient(LoopClient):
         self._missed = 0.0
         self.why_ended: Callable[[], str] | None = None
         """Tells why the process of relay_node has ended, empty: it runs; None: it is another's."""
-        self.left_behind = (
+        self.left_behind: Callable[[], str] = lambda: (
             "nobody publishes the command, and the last one stays in force; see to the plant"
         )
-        """What follows where relay_node is lost during a tune."""
+        """Tells what follows where relay_node is lost during a tune."""
         self.refused: set[str] = set()
         """Sentences on results that were received and refused."""
 
@@ -137,17 +139,19 @@ class TuneClient(LoopClient):
                 f"{self.name} has ended, and the tune before it: the safe command is out; the log "
                 f"and the recording say how the tune ended"
             )
-        raise LoopError(f"during the tune {why}; {self.left_behind}".rstrip("; "))
+        raise LoopError(f"during the tune {why}; {self.left_behind()}".rstrip("; "))
 
     def _why_gone(self, looked: float) -> str:
         """Return why relay_node must be gone; empty: it is there, or may only be late.
 
-        A lease that has run out proves nothing where the process can be asked.
+        A lease that has run out proves little where the process can be asked.
 
         :param looked: for how long it was looked for [s].
         """
         if self.why_ended is not None:
             why, limit = self.why_ended(), _LAST_WORDS
+            if not (why or self._alive):
+                why, limit = f"{self.name} hangs", _HUNG
         else:
             is_there = self._alive and self._action.server_is_ready()
             why = "" if is_there else f"{self.name} has gone, or cannot be heard any more"

@@ -177,12 +177,11 @@ def test_a_proof_that_is_ended_leaves_the_command_before_the_tune(
     os.kill(hit, number)
     rig.until(lambda: process.poll() is not None, "its end")
     output = process.stdout.read()
-    if node == "relay_node":
-        # Nobody can publish the command any more.
-        assert "the last command stays in force; see to the plant" in process.stderr.read()
-        return
     rig.until(lambda: not any(map(is_there, started)), "the end of its nodes")
     rig.until(lambda: heard[-1].data == 2.0, "the command before the tune")
+    if node == "relay_node":
+        assert "the safe command 2 u was sent in its place" in process.stderr.read()
+        return
     if node or number != signal.SIGKILL:
         assert "the command stands at 2 u" in output
 
@@ -217,7 +216,23 @@ def test_a_node_that_starves_is_not_taken_for_gone_and_one_that_is_killed_is_mis
     os.kill(relay, signal.SIGKILL)
     _, said = process.communicate(timeout=15.0)
     assert "during the tune relay_node was ended by signal 9 (Killed)" in said
-    assert "see to the plant" in said
+    assert "the safe command 2 u was sent in its place" in said
+    rig.until(lambda: heard[-1].data == 2.0, "the safe command")
+
+
+def test_a_node_that_hangs_is_ended_and_the_safe_command_sent(rig: Rig) -> None:
+    heard = rig.listen("/tank/valve", Float64, RELIABLE)
+    rig.start("plant_node", *TOPICS, **FAST | {"time_constants": [50.0]})
+    process = begun(rig, "--record-only")
+    rig.until(lambda: any(m.data != 2.0 for m in heard), "a step", timeout=90.0)
+    (relay,) = nodes_of(process.pid)
+    rig.processes[0].segments |= mapped_segments(relay)
+    os.kill(relay, signal.SIGSTOP)
+    _, said = process.communicate(timeout=60.0)
+    assert process.returncode == 1
+    assert "hangs; the safe command 2 u was sent in its place" in said
+    rig.until(lambda: heard[-1].data == 2.0, "the safe command")
+    assert not is_there(relay)
 
 
 def test_a_command_at_which_the_process_does_not_rest_ends_the_tune(rig: Rig) -> None:
