@@ -268,7 +268,7 @@ class AfterTune(Tuned):
         again = f"{prefix()}replay {bag} --export {written.how}"
         if written.doubt and self.options.export and not self.options.accept_doubtful:
             again += " --accept-doubtful"
-            say(PROGRAM, f"{file} is not written: the gains are doubtful; to have it: {again}")
+            say(PROGRAM, f"{file} is not written: {written.doubt}; to have it: {again}")
             return False
         try:
             text = exported(written.gains, written.how, self.loop.target, doubt=written.doubt)
@@ -418,6 +418,10 @@ class AfterTune(Tuned):
         if why := self.loop.nodes.why_lost():
             say(PROGRAM, f"{why}; {self.loop.client.left_behind()}")
             return
+        sent = f"{self.options.at:.6g} u, the command that you gave"
+        if others := self.loop.client.others_on(self.options.command):
+            tell("left", f"{sent}, was sent, but {others} commands, too, and goes on")
+            return
         then = (
             "do not start a controller with these gains, they are not proven"
             if against
@@ -425,8 +429,7 @@ class AfterTune(Tuned):
         )
         tell(
             "left",
-            f"the command stands at {self.options.at:.6g} u, the command that you gave, and "
-            f"nobody controls the loop any more: {then}",
+            f"the command stands at {sent}, and nobody controls the loop any more: {then}",
         )
 
 

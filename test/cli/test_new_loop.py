@@ -933,7 +933,7 @@ def shown(
     found.numerator, found.denominator = [1.65], [1.0, 1.0]
     client: Any = SimpleNamespace(
         name="relay_node", result=result, record=lambda patience: record,
-        identifier_values=lambda patience: None,
+        identifier_values=lambda patience: None, others_on=lambda topic: "",
     )  # fmt: skip
     given = tune_loop._parser().parse_args(
         ["--measurement", "/tank/level", "--command", "/tank/valve"]

@@ -186,6 +186,28 @@ def test_a_proof_that_is_ended_leaves_the_command_before_the_tune(
         assert "the command stands at 2 u" in output
 
 
+@pytest.mark.nightly
+def test_another_node_that_commands_ends_a_proof(rig: Rig) -> None:
+    rig.start("plant_node", *TOPICS, **SLOWER | {"noise_std": 0.002})
+    process = begun(rig, "--verify", "--step", "2")
+    os.set_blocking(process.stderr.fileno(), False)
+    said = bytearray()
+
+    def is_stepping() -> bool:
+        with suppress(BlockingIOError):
+            said.extend(os.read(process.stderr.fileno(), 1 << 16))
+        return b"step 1 of 1" in said
+
+    rig.until(is_stepping, "the step", timeout=180.0)
+    other = rig.node.create_publisher(Float64, "/tank/valve", RELIABLE)
+    rig.until(lambda: process.poll() is not None, "its end")
+    rig.node.destroy_publisher(other)
+    assert process.returncode != 0
+    name = rig.node.get_fully_qualified_name()
+    assert f"{name} commands /tank/valve, too" in process.stderr.read()
+    assert f"was sent, but {name} commands, too" in " ".join(process.stdout.read().split())
+
+
 def test_if_the_command_is_killed_its_nodes_end_with_the_safe_command(rig: Rig) -> None:
     heard = rig.listen("/tank/valve", Float64, RELIABLE)
     rig.start("plant_node", *TOPICS, **FAST | {"time_constants": [50.0]})
