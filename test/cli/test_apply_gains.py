@@ -312,7 +312,7 @@ def test_a_proof_says_what_happens_if_it_fails_and_then_holds_no_command(
         within=(30.0, 50.0), command_within=(0.0, 5.0), step=0.5, measurement="/level",
         command="/valve",
     )  # fmt: skip
-    loop = SimpleNamespace(options=options)
+    loop = SimpleNamespace(options=options, client=None)
     tune: Any = SimpleNamespace(result=result, record=record, options=options, loop=loop)
     proof = Proof(tune)
     assert dict(proof.plan(proof.step))["if it fails"] == (

@@ -135,6 +135,19 @@ def test_the_session_of_the_tutorial_leads_to_proven_gains_and_leaves_nothing_ru
     rig.until(lambda: not ours & set(rig.node.get_node_names()), "the end of its nodes")
 
 
+def until_it_steps(rig: Rig, process: subprocess.Popen[str]) -> None:
+    """Wait until a proof makes its step."""
+    os.set_blocking(process.stderr.fileno(), False)
+    said = bytearray()
+
+    def is_stepping() -> bool:
+        with suppress(BlockingIOError):
+            said.extend(os.read(process.stderr.fileno(), 1 << 16))
+        return b"step 1 of 1" in said
+
+    rig.until(is_stepping, "the step", timeout=180.0)
+
+
 @pytest.mark.nightly
 @pytest.mark.parametrize(
     ("number", "node"),
@@ -153,15 +166,7 @@ def test_a_proof_that_is_ended_leaves_the_command_before_the_tune(
     heard = rig.listen("/tank/valve", Float64, RELIABLE)
     rig.start("plant_node", *TOPICS, **SLOWER | {"noise_std": 0.002})
     process = begun(rig, "--verify", "--step", "2")
-    os.set_blocking(process.stderr.fileno(), False)
-    said = bytearray()
-
-    def is_stepping() -> bool:
-        with suppress(BlockingIOError):
-            said.extend(os.read(process.stderr.fileno(), 1 << 16))
-        return b"step 1 of 1" in said
-
-    rig.until(is_stepping, "the step", timeout=180.0)
+    until_it_steps(rig, process)
     started = nodes_of(process.pid)
     assert len(started) == 3
     by_name = {
@@ -190,15 +195,7 @@ def test_a_proof_that_is_ended_leaves_the_command_before_the_tune(
 def test_another_node_that_commands_ends_a_proof(rig: Rig) -> None:
     rig.start("plant_node", *TOPICS, **SLOWER | {"noise_std": 0.002})
     process = begun(rig, "--verify", "--step", "2")
-    os.set_blocking(process.stderr.fileno(), False)
-    said = bytearray()
-
-    def is_stepping() -> bool:
-        with suppress(BlockingIOError):
-            said.extend(os.read(process.stderr.fileno(), 1 << 16))
-        return b"step 1 of 1" in said
-
-    rig.until(is_stepping, "the step", timeout=180.0)
+    until_it_steps(rig, process)
     other = rig.node.create_publisher(Float64, "/tank/valve", RELIABLE)
     rig.until(lambda: process.poll() is not None, "its end")
     rig.node.destroy_publisher(other)

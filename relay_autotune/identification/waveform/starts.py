@@ -86,9 +86,10 @@ def is_unobservable(
 
 
 _GRID_SAMPLES = 240
-# Number of rates that are tried, and the lowest one's time over the longest dead time; to which
-# part the best one is known, and the largest share of the squares that it leaves.
-_RATES, _LONGER, _RATE_KNOWN, _LESS = 16, 4.0, 0.01, 0.8
+# Number of rates that are tried, and the lowest one's time over the longest dead time; how many
+# times as much as another one leaves, after which slower ones are hopeless; to which part the best
+# one is known, and the largest share of the squares that it leaves.
+_RATES, _LONGER, _TOO_SLOW, _RATE_KNOWN, _LESS = 16, 4.0, 3.0, 0.01, 0.8
 _BEST = 3
 _COARSE = 1e-4
 # Rounds of steps on few samples: largest number of steps, and how many starts take them.
@@ -398,20 +399,24 @@ def likeliest_rate(problem: Problem) -> float | None:
     :return: None: that any is followed explains about as much.
     """
     few, (shortest, longest) = coarse(problem), time_scales(problem)
-    # By which the command crosses its range in a sample, or in a few of the longest dead times.
-    rates = float(np.ptp(problem.levels)) / np.geomspace(_LONGER * longest, shortest, _RATES)
-    each = [replace(few, rate=rate) for rate in rates]
-    fits = [best_of(at, start_fopdt(at)) for at in each]
-    k = min(range(_RATES), key=lambda i: fits[i].cost)
+    # By which the command crosses its range in a sample, and in a few of the longest dead times.
+    rates = float(np.ptp(problem.levels)) / np.geomspace(shortest, _LONGER * longest, _RATES)
+    fits: list[Trial] = []
+    for rate in rates:
+        at = replace(few, rate=rate)
+        fits.append(best_of(at, start_fopdt(at)))
+        if fits[-1].cost > _TOO_SLOW * min(fit.cost for fit in fits):
+            break
+    k = min(range(len(fits)), key=lambda i: fits[i].cost)
     if k in (0, _RATES - 1):
         return None
 
     def cost(log: float) -> float:
         return refine(replace(few, rate=math.exp(log)), fits[k].theta, tolerance=TRIAL).cost
 
-    within = np.log((rates[k - 1], rates[k + 1]))
+    within = np.log((rates[k + 1], rates[k - 1]))
     found = minimize_scalar(cost, bounds=within, method="bounded", options={"xatol": _RATE_KNOWN})
-    return math.exp(found.x) if found.fun < _LESS * best_of(few, start_fopdt(few)).cost else None
+    return math.exp(found.x) if found.fun < _LESS * fits[0].cost else None
 
 
 def shifted_columns(
