@@ -273,6 +273,8 @@ class Search:
         point, iae = alone.least(scanned)
         if self.around is None:
             point, iae = self.settle(bounds, *self.descend(bounds, point, iae))
+            if not math.isfinite(iae):
+                return None
             best = self._at(bounds, point[None])
         else:
             point, _ = alone.descend(bounds, point, iae, _ROUGH)
@@ -304,6 +306,8 @@ class Search:
             point, iae = search.descend(bounds, *found, steps)
             if steps == _FINE:
                 point, iae = search.settle(bounds, point, iae)
+            if not math.isfinite(iae):
+                return None
             best = search._at(bounds, point[None])
             more = asked.with_failed(bounds, best)
             if more is None and steps == _FINE:
@@ -330,9 +334,13 @@ class Search:
         :param bounds: on the sensitivities.
         :param point: as for :meth:`descend`.
         :param iae: there [y s/u].
+        :return: with an infinite IAE where none is near.
         """
         for _ in range(_MOST_ADDED):
-            controller = self._controller(self._at(bounds, point[None]))
+            best = self._at(bounds, point[None])
+            if not best.ki[0] > 0.0:
+                return point, math.inf
+            controller = self._controller(best)
             exact = Loop(self.rate.of(controller), self.model)
             found = zip(peaks(exact, exact.grid), (bounds.ms, bounds.mt), strict=True)
             missed = [w for (peak, w), bound in found if peak > _HELD * bound]

@@ -95,6 +95,18 @@ def test_the_least_iae_of_pid(name, inputs, exact, tol):
     assert analyse_loop(found.controller, model).iae_load <= exact["IAE_load"] * 1.008
 
 
+def test_no_controller_is_told_where_none_keeps_the_bounds_between_frequencies(monkeypatch):
+    """It was one of infinite gain, which was refused with a sentence on its numbers."""
+    search, at = Search(TransferFunction.fopdt(1.0, 1.0, 1.0)), Search._at
+
+    def none_of_one(self, bounds, points, *iae):
+        found = at(self, bounds, points, *iae)
+        return replace(found, ki=np.full(1, -np.inf)) if found.ki.size == 1 else found
+
+    monkeypatch.setattr(Search, "_at", none_of_one)
+    assert search.optimum(Bounds(1.4), derivative=False) is None
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("ratio", "pi", "pid"), [(0.22, 1.61, 1.35), (0.3, 1.97, 1.52), (0.5, 3.55, 2.08)]
