@@ -74,12 +74,14 @@ class _Written:
 
     :param gains: the gains.
     :param how: for which program, or "yaml".
-    :param doubt: what speaks against them; empty: nothing.
+    :param doubt: why they are doubtful; empty: they are trusted.
+    :param unproven: why a proof of them has not passed; empty: it has, or none was made.
     """
 
     gains: Gains
     how: str
     doubt: str
+    unproven: str
 
 
 @dataclass
@@ -234,15 +236,16 @@ class AfterTune(Tuned):
             the commands that follow, each with its purpose.
         """
         options, loop, gains = self.options, self.loop, self.gains
-        proven, against = self._tried()
+        proven, unproven = self._tried()
+        against = unproven or self.doubt * (proven is None)
         steps = self._own_controller() if loop.proves and not against else []
-        first = _Written(gains, exports_of(gains.law)[0], against or self.doubt)
+        first = _Written(gains, exports_of(gains.law)[0], self.doubt, unproven)
         written, file = first, options.export
         asks = loop.proves and not (file or options.yes) and sys.stdin.isatty()
         if asks:
-            written, file = self._asked(first, against)
+            written, file = self._asked(first)
         while file and not self._write(written, file) and asks:
-            written, file = self._asked(first, against)
+            written, file = self._asked(first)
         if written.gains is not gains and not against:
             law = {"law": written.gains.law, "sample_period": written.gains.law_period}
             steps.append(self._to_prove(f"prove those for {written.how}", **law))
@@ -266,12 +269,15 @@ class AfterTune(Tuned):
         # The tune is made, and its recording has the gains.
         bag = shlex.quote(self.result.bag or "BAG")
         again = f"{prefix()}replay {bag} --export {written.how}"
-        if written.doubt and self.options.export and not self.options.accept_doubtful:
-            again += " --accept-doubtful"
-            say(PROGRAM, f"{file} is not written: {written.doubt}; to have it: {again}")
+        doubt, unproven = written.doubt, written.unproven
+        why = f"not proven: {unproven}" if unproven else f"doubtful: {doubt}" if doubt else ""
+        if why and self.options.export and not self.options.accept_doubtful:
+            again += " --accept-doubtful" * bool(doubt)
+            say(PROGRAM, f"{file} is not written: the gains are {why}; to have it: {again}")
             return False
         try:
-            text = exported(written.gains, written.how, self.loop.target, doubt=written.doubt)
+            target = self.loop.target
+            text = exported(written.gains, written.how, target, doubt=doubt, unproven=unproven)
         except SelectionError as error:
             say(PROGRAM, f"{file} is not written: {error}, such as {again}")
             return False
@@ -285,32 +291,32 @@ class AfterTune(Tuned):
         print(f"  {'gains for':<16} {written.how}: {Path(file).resolve()}")
         return True
 
-    def _asked(self, first: _Written, against: str) -> tuple[_Written, str]:
+    def _asked(self, first: _Written) -> tuple[_Written, str]:
         """Ask for which program the gains are to be written, and to which file.
 
         :param first: the gains of the tune.
-        :param against: what a proof says against them; empty: nothing.
         :return: the gains to write, and the file; empty: none.
         """
         chosen, own = first, exports_of(first.gains.law)
+        all_the_same = " all the same" * bool(first.unproven or first.doubt)
         names = ", ".join(name for name in EXPORTS if name != first.how)
         print()
         tell("file for", f"{first.how}; type another name to design for it: {names}")
         while True:
-            what = f"Write the gains for {chosen.how}{' all the same' * bool(against)}"
+            what = f"Write the gains for {chosen.how}{all_the_same}"
             answer = asked_for_file(what, EXPORTS)
             if answer not in EXPORTS:
                 return chosen, answer
             try:
                 chosen = (
-                    _Written(first.gains, answer, first.doubt)
+                    replace(first, how=answer)
                     if answer in own
-                    else self._designed(answer, against)
+                    else self._designed(answer, first.unproven)
                 )
             except RelayAutotuneError as error:
                 say(PROGRAM, f"{answer}: {error}")
 
-    def _designed(self, law: str, against: str) -> _Written:
+    def _designed(self, law: str, unproven: str) -> _Written:
         """Design gains for the law of a program, from the record of the tune, and show them."""
         # One machine runs either program.
         period = self.gains.law_period or float(f"{self.record.mean_interval:.3g}")
@@ -324,7 +330,7 @@ class AfterTune(Tuned):
         text = ", ".join(f"{name} {digits(getattr(gains, name))}" for name in ("kc", "ti", "td"))
         text += f", every {period:g} s; {'; '.join(gains.warnings) or 'Ms ' + digits(gains.ms, 3)}"
         tell(f"for {law}", text)
-        return _Written(gains, law, against or found.judgement.reason)
+        return _Written(gains, law, self.doubt or found.judgement.reason, unproven)
 
     def _own_controller(self) -> Steps:
         """Return the commands that control the loop with the gains, without other controllers."""
@@ -355,21 +361,21 @@ class AfterTune(Tuned):
         Without a controller of its own, the command is then that at which the process rested
         before the tune, however it ends.
 
-        :return: whether that has succeeded, None: it was not wanted; and what speaks against the
-            gains in the end, empty: nothing.
+        :return: whether that has succeeded, None: it was not wanted; and why the gains are not
+            proven, empty: they are, or nobody has tried.
         """
         loop = self.loop
-        passed, against = None, _UNFINISHED
+        passed, unproven = None, _UNFINISHED
         try:
             passed, failed = self._offered() if loop.proves else loop.apply(self.doubt)
-            against = _FAILED.format(failed) if failed else self.doubt * (passed is None)
+            unproven = _FAILED.format(failed) if failed else ""
         except RelayAutotuneError as error:
             say(PROGRAM, f"the gains are not proven: {error}")
-            passed, against = False, f"not proven: {error}"
+            passed, unproven = False, str(error)
         finally:
             if loop.proves:
-                self._say_what_is_left(against)
-        return passed, against
+                self._say_what_is_left(unproven or self.doubt * (passed is None))
+        return passed, unproven
 
     def _offered(self) -> tuple[bool | None, str]:
         """Offer to prove the gains; return what `Loop.apply` returns."""

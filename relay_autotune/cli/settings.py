@@ -205,7 +205,7 @@ SETTINGS = (
         "joint; an existing file is refused at once"
     ),
     Setting("accept_doubtful", False, loops=(*_JOINTS, Kind.TOPICS)).means(
-        "with --output: also gains that are doubtful"
+        "with --output: also gains that are doubtful, or whose proof has not passed"
     ),
     Setting("controller", "", metavar="NAME", loops=_JOINTS).means(
         "an active pid_controller, or with --open a joint_trajectory_controller; of several "

@@ -96,21 +96,24 @@ class Target:
         return low, high
 
 
-def exported(gains: Gains, how: str, target: Target, *, doubt: str = "") -> str:
+def exported(
+    gains: Gains, how: str, target: Target, *, doubt: str = "", unproven: str = ""
+) -> str:
     """Return gains as the text of a file.
 
     :param gains: what is to be loaded.
     :param how: a law of :data:`~relay_autotune.loop.laws.LAWS`, "yaml" or "launch".
     :param target: for a controller of ros2_controllers: where they go.
     :param doubt: what to look at before they are used; empty: they are trusted.
+    :param unproven: why a proof of them has not passed; empty: it has, or none was made.
     :raises SelectionError: if they are for another law.
     """
     text = in_units(_file(gains, how, target), target.units)
-    if not doubt:
-        return text
-    return (
-        f"{LAWS[how].remark if how in LAWS else '#'} DOUBTFUL: {' '.join(doubt.split())}\n{text}"
-    )
+    for what, why in (("DOUBTFUL", doubt), ("NOT PROVEN", unproven)):
+        if why:
+            remark = LAWS[how].remark if how in LAWS else "#"
+            text = f"{remark} {what}: {' '.join(why.split())}\n{text}"
+    return text
 
 
 def _file(gains: Gains, how: str, target: Target) -> str:

@@ -985,7 +985,7 @@ def shown(
         proven, steps = AfterTune(loop).hand_over()
         assert proven is passed
         assert not typed
-        told = " ".join(capsys.readouterr().out.split())
+        told = " ".join(" ".join(capsys.readouterr()).split())
         return " ".join([told, "NEXT", *(word for step in steps for word in step)])
 
     return show
@@ -1021,7 +1021,7 @@ def test_gains_that_failed_are_not_recommended_and_their_file_says_so(
     assert f"controller_node: {tmp_path / 'failed.yaml'}" in failed
     assert failed.endswith("NEXT")
     first = (tmp_path / "failed.yaml").read_text().splitlines()[0]
-    assert first == "# DOUBTFUL: the step that was to prove them failed: it runs away"
+    assert first == "# NOT PROVEN: the step that was to prove them failed: it runs away"
     assert "they are not proven" in shown(None, "few cycles", "")
     assert "start your own controller with these gains" in shown(True, "", "passed.yaml")
     text = (tmp_path / "passed.yaml").read_text()
@@ -1039,7 +1039,8 @@ def test_doubtful_gains_are_exported_unasked_by_a_flag_alone(
     shown: Callable[..., str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     file = tmp_path / "gains.yaml"
-    shown(None, "few cycles", bag="tune", export=str(file))
+    told = shown(None, "few cycles", bag="tune", export=str(file))
+    assert "not written: the gains are doubtful: few cycles; to have it: replay tune" in told
     assert not file.exists()
     shown(None, "few cycles", export=str(file), accept_doubtful=True)
     assert file.read_text().startswith("# DOUBTFUL: few cycles")
@@ -1049,14 +1050,15 @@ def test_gains_that_failed_at_a_joint_are_exported_with_that_or_not_at_all(
     shown: Callable[..., str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     file = tmp_path / "gains.yaml"
-    shown(False, "failed: it runs away", bag="tune", export=str(file), at_joint=True)
+    told = shown(False, "failed: it runs away", bag="tune", export=str(file), at_joint=True)
+    assert "not written: the gains are not proven: the step" in told and "doubtful" not in told
     assert not file.exists()
     shown(False, "failed: it runs away", export=str(file), accept_doubtful=True, at_joint=True)
     first = file.read_text().splitlines()[0]
-    assert first == "# DOUBTFUL: the step that was to prove them failed: it runs away"
+    assert first == "# NOT PROVEN: the step that was to prove them failed: it runs away"
     file.unlink()
     shown(True, "", export=str(file), at_joint=True)
-    assert "DOUBTFUL" not in file.read_text()
+    assert not re.search("DOUBTFUL|NOT PROVEN", file.read_text())
 
 
 def test_a_program_that_is_named_gets_gains_of_its_own_and_a_start_without_a_bump(
@@ -1070,7 +1072,7 @@ def test_a_program_that_is_named_gets_gains_of_its_own_and_a_start_without_a_bum
     (period,) = re.findall(r"Designed for iec_61131_3_pid every ([\d.]+) s", text)
     assert f"--law iec_61131_3_pid --sample-period {period} --verify" in told
     other = shown(False, "failed: it runs away", "px4_rate", "0.1", "px4.txt")
-    told = "# DOUBTFUL: the step that was to prove them failed: it runs away"
+    told = "# NOT PROVEN: the step that was to prove them failed: it runs away"
     assert told in (tmp_path / "px4.txt").read_text()
     assert other.endswith("NEXT")
 
