@@ -480,7 +480,7 @@ class Code(enum.IntEnum):
     SECOND_PUBLISHER = _Row(
         250,
         "{topic} is also published by {others}: two of them would fight for the actuator",
-        "end that one for the tune, or let it command through relay_node",
+        "end that one, or let it command through relay_node",
     )
     """A second node commands: stop it, connect it to controller_command, or give path takeover.
     One that was killed is forgotten after about 20 s."""

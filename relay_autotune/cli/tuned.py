@@ -26,7 +26,7 @@ from relay_autotune.cli.tune_view import Paint, result_lines
 from relay_autotune.control.controller import Control, PredictedLoop
 from relay_autotune.control.step_choice import StepChoice, StepRange
 from relay_autotune.control.verification import RUNAWAY, SETTLES, noise_of
-from relay_autotune.errors import LoopError, TuningError
+from relay_autotune.errors import TuningError
 from relay_autotune.exchange.messages import (
     gains_from_message,
     transfer_function_from_message,
@@ -235,6 +235,8 @@ class Proof:
             # identifier_node's own gains, which may come late, are not the ones to be proven.
             topics = {
                 "measurement": loop.options.measurement,
+                # It ends the proof where another node commands, too.
+                "command": loop.options.command,
                 "pi_gains": f"{loop.space}/gains_of_{CONTROLLER}",
             }
             loop.nodes.start(CONTROLLER, ros_arguments(loop.space, topics, values))
@@ -254,23 +256,13 @@ class Proof:
         :param leave: returns True to end the step.
         :return: the `Verify.Result`; what it has found, of which gains and when; and its steps
             with their samples.
-        :raises LoopError: with the reason, if there is no verdict, as where another node commands.
+        :raises LoopError: with the reason, if there is no verdict.
         """
         patience = max(_TIMES_SETTLING * self._choice.settles, _REST_WITHIN)
-        client, command = self._loop.client, self._loop.options.command
-
-        def ends() -> bool:
-            return leave() or client.is_shared(command)
-
         with self._started(doubtful) as controller:
             tell(f"starting {CONTROLLER}")
             controller.find(START_WITHIN, leave)
-            try:
-                found = controller.prove(step, 0.0, patience, tell, ends, self._message)
-            except LoopError as error:
-                if others := client.others_on(command):
-                    raise LoopError(f"{others} commands {command}, too; {error}") from None
-                raise
+            found = controller.prove(step, 0.0, patience, tell, leave, self._message)
             if found.verdict == found.PASSED:
                 # Without gains it would hold its command, wherever that is.
                 controller.let_settle(self._choice.settles, tell, leave)

@@ -223,6 +223,8 @@ class ControllerNode(ProvenNode):
     def _look(self) -> None:
         self._sensor.look()
         self._verifier.look()
+        if self._verifier.is_running and (why := self._second_commander()):
+            self._verifier.interrupt(why)
 
     # The loop.
 
@@ -299,6 +301,25 @@ class ControllerNode(ProvenNode):
             self._commands.send(self._settings.limits.clip(command + self._load))
         if math.isfinite(value) and math.isfinite(command):
             self._verifier.sample(at, value, command)
+
+    def _second_commander(self) -> Reason | None:
+        """Return a reason if a node commands that neither controls the loop nor is relay_node."""
+
+        def publishers(topic: str) -> list[str]:
+            return [quality.who(end) for end in self.get_publishers_info_by_topic(topic)]
+
+        topics = {self.resolve_topic_name("command")} if self._reported is None else set()
+        if self._remote is None:
+            own = self.get_fully_qualified_name()
+            topics.add(self._commands.topic)
+        else:
+            own = self.resolve_topic_name(self._remote.name.rstrip("/"))
+        known = {own, quality.UNNAMED, *publishers(self.resolve_topic_name("hold_request"))}
+        for topic in topics:
+            names = publishers(topic)
+            if len(names) > 1 and (others := sorted({*names} - known)):
+                return Code.SECOND_PUBLISHER(topic=topic, others=" and ".join(others))
+        return None
 
     def _is_untaken(self) -> bool:
         """Tell whether nobody subscribes to the commands, and log where that has changed."""

@@ -471,13 +471,6 @@ class LoopClient:
         self.wait(lambda: quality.UNNAMED not in found(), _LISTEN)
         return " and ".join(found())
 
-    def is_shared(self, topic: str) -> bool:
-        """Return whether several nodes publish a topic.
-
-        :param topic: its name.
-        """
-        return bool(self._node.count_publishers(self._resolved(topic)) > 1)
-
     def claim(self, kind: Any, topic: str) -> Callable[[], object]:
         """Show to others that this client is about to command, and return what ends that.
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import signal
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -41,20 +42,23 @@ def test_gains_do_not_fail_when_relay_node_is_killed(rig: Rig, lag: float) -> No
     client = ActionClient(rig.node, Verify, "controller_node/verify")
     rig.until(client.server_is_ready, "the action")
 
-    def proof(step: float = 0.5, *, kills: bool = False) -> Any:
+    def proof(step: float = 0.5, during: Callable[[], object] | None = None) -> Any:
         told: list[Any] = []
         goal = Verify.Goal(setpoint_step=step, patience=60.0)
         sent = client.send_goal_async(goal, feedback_callback=told.append)
         rig.until(sent.done, "the goal")
         answer = sent.result().get_result_async()
-        if kills:
+        if during is not None:
             rig.until(lambda: told and told[-1].feedback.remaining > 0.0, "the step")
-            relay.signal(signal.SIGKILL)
-            relay.wait()
+            during()
         rig.until(answer.done, "the result")
         return answer.result().result
 
-    result = proof(kills=True)
+    def kill() -> None:
+        relay.signal(signal.SIGKILL)
+        relay.wait()
+
+    result = proof(during=kill)
     assert result.verdict == result.NONE, result.reason
     assert result.why.code == Code.INTERFERED
     assert "no command on /command for" in result.reason
@@ -67,4 +71,8 @@ def test_gains_do_not_fail_when_relay_node_is_killed(rig: Rig, lag: float) -> No
     before = len(commands)
     rig.until(lambda: len(commands) > before + 50, "a closed loop again")
     assert "verify_step_max allows 0.5" in proof(0.6).reason
+    # Nor do they fail by another node that commands.
+    result = proof(during=lambda: rig.node.create_publisher(Float64, "command", RELIABLE))
+    assert result.why.code == Code.SECOND_PUBLISHER, result.reason
+    assert "/command is also published by /onlooker" in result.reason
     client.destroy()
