@@ -691,11 +691,11 @@ class Code(enum.IntEnum):
     """A tune and a verification exclude each other."""
     NOT_AT_REST = _Row(
         520,
-        "the loop is not at rest: the measurement moved by {drift:.3g} over the last {samples} "
-        "samples",
+        "the loop is not at rest[: the measurement moved by {drift:.3g} over the last {samples} "
+        "samples][ at its set-point: the measurement is {away:.3g} away from it]",
         "wait until it has settled",
     )
-    """A step is seen on a loop at rest alone."""
+    """A step is seen on a loop at rest at its set-point alone."""
     STEP_SILENT = _Row(521, "no measurement for {silence:.3g} s")
     """The sensor has fallen silent."""
     STEP_TIME_STANDS = _Row(522, "the time of the samples stands still: is /clock published?")

@@ -550,7 +550,13 @@ class ControllerNode(ProvenNode):
             raise NotReadyError(Code.DOUBTFUL_MODEL(doubt=doubt))
         steps, limits = self._steps_of(request), self._settings.limits
         loop = PredictedLoop(self._place.control(self._place.controller_of(kept)), model)
-        return Verifiable(steps, new, settles, loop, limits)
+        # Without an integral it rests anywhere.
+        setpoint = self._present_setpoint if loop.control.gains.ti else math.nan
+        return Verifiable(steps, new, settles, loop, limits, setpoint)
+
+    @property
+    def _present_setpoint(self) -> float:
+        return self._setpoint if self._remote is None else self._remote.setpoint
 
     def _steps_of(self, request: Verify.Goal) -> list[Step]:
         height = request.setpoint_step or self.get_parameter("verify_step").value
@@ -569,10 +575,9 @@ class ControllerNode(ProvenNode):
                 f"setpoint_step is {height:g}, verify_step_max allows {highest:g}: set it to the "
                 "largest step that the process may be given"
             )
-        setpoint = self._setpoint if self._remote is None else self._remote.setpoint
-        if height and not self._is_possible(setpoint + height):
+        if height and not self._is_possible(goes_to := self._present_setpoint + height):
             raise NotReadyError(
-                f"the step leads to the set-point {setpoint + height:g}, beyond {self._range}"
+                f"the step leads to the set-point {goes_to:g}, beyond {self._range}"
             )
         if request.load_step and self._remote is not None:
             raise NotReadyError(

@@ -44,7 +44,7 @@ from relay_autotune_msgs.msg import Verification
 # Number of samples before a step, for the loop's rest and noise.
 _BEFORE = 50
 _LEAST_BEFORE = 10
-# A loop at rest moves by less than this part of a step.
+# A loop at rest moves by less than this part of a step, and is no further from its set-point.
 _STILL = 0.1
 # Slow noise moves the mean of a few samples by this many standard deviations at most.
 _SLOW_NOISE = 4.0
@@ -77,6 +77,7 @@ class Verifiable:
     :param settles: how long the loop takes to settle with new gains [s]; NaN: not known.
     :param loop: the controller to be tried, and the process as identified.
     :param limits: range of the command.
+    :param setpoint: about which the loop has to rest [y]; NaN: nothing brings it there.
     """
 
     steps: Sequence[Step]
@@ -84,6 +85,7 @@ class Verifiable:
     settles: float
     loop: PredictedLoop
     limits: Limits
+    setpoint: float
 
 
 class Predictors:
@@ -378,7 +380,7 @@ class Verifier:
             self._until += patience - request.patience
         begun = time.monotonic()
         rest, period = await self._once_ready(
-            lambda: self._at_rest(tried.steps, time.monotonic() - begun < 0.5 * patience),
+            lambda: self._at_rest(tried, time.monotonic() - begun < 0.5 * patience),
             begun + patience,
         )
         loop, noise = tried.loop, rest.noise_std
@@ -503,10 +505,10 @@ class Verifier:
         theirs = self._recent[-1][0] - self._recent[0][0]
         return ours / theirs if theirs > 0.0 else 1.0
 
-    def _at_rest(self, steps: Sequence[Step], may_settle: bool) -> tuple[Rest, float]:
+    def _at_rest(self, tried: Verifiable, may_settle: bool) -> tuple[Rest, float]:
         """Return the loop's state of rest and its sample period [s].
 
-        :param steps: that are to be made.
+        :param tried: what is to be verified.
         :param may_settle: True: a slow movement may be the rest of a transient; False: after so
             long it is the noise of this loop.
         """
@@ -516,13 +518,16 @@ class Verifier:
         if not period > 0.0:
             raise NotReadyError(Code.STEP_TIME_STANDS())
         found = rest_state(t - t[0], y, len(t))
-        smallest = min((abs(s.setpoint) for s in steps if s.setpoint), default=math.inf)
+        smallest = min((abs(s.setpoint) for s in tried.steps if s.setpoint), default=math.inf)
         moved, by_noise = slow_movement(y)
         if not may_settle:
             by_noise = _SLOW_NOISE * found.noise_std
         # What is left of a transient shifts the rest, and would count as noise.
         if moved > max(by_noise, _STILL * smallest):
             raise NotReadyError(Code.NOT_AT_REST(drift=moved, samples=len(self._recent)))
+        away = abs(found.mean - tried.setpoint)
+        if away > max(by_noise / math.sqrt(len(y)), _STILL * smallest):
+            raise NotReadyError(Code.NOT_AT_REST(away=away))
         return Rest(found.mean, float(u.mean()), found.noise_std), period
 
     # While it runs.

@@ -87,7 +87,7 @@ def test_a_sensor_that_is_too_coarse_for_a_step_gives_no_verdict() -> None:
     gains, step = Controller(0.5, 0.6), Step(setpoint=0.01)
     model = TransferFunction.fopdt(2.0, 0.5, 0.2)
     loop = PredictedLoop(Control(gains), model)
-    tried = Verifiable([step], None, math.nan, loop, UNLIMITED)
+    tried = Verifiable([step], None, math.nan, loop, UNLIMITED, math.nan)
     planned, rest = plan(loop, step, 0.05), Rest(5.0, 1.0, 0.0)
     time = np.arange(0.0, planned.duration, 0.05)
     exact = 5.0 + loop.run(time, Step(setpoint=0.01)).measurement

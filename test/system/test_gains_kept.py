@@ -10,12 +10,13 @@ import math
 import signal
 
 import pytest
-from hand_loop import SETPOINT, HandLoop
+from hand_loop import COMMAND, SETPOINT, HandLoop
 from loop_rig import RELIABLE, Rig
 from made_experiments import experiment_of
 from std_msgs.msg import Float64
 
 from relay_autotune.process.transfer_function import TransferFunction as Process
+from relay_autotune.reasons import Code
 from relay_autotune_msgs.action import Verify
 
 GOOD, WILD = (0.5, 0.6), (0.9, 0.3)
@@ -250,6 +251,16 @@ def test_a_step_that_the_noise_hides_changes_nothing(rig: Rig) -> None:
         assert "y cannot be judged" in result.reason
         assert loop.gains_shown() == GOOD
     # It was not on trial, so that it did not fail.
+    assert loop.verify(setpoint_step=0.3).verdict == Verify.Result.PASSED
+
+
+def test_a_loop_that_rests_away_from_its_set_point_makes_no_step(rig: Rig) -> None:
+    loop = HandLoop(rig, kc=0.3, ti=1.0, initial_setpoint=SETPOINT + 0.1, command_max=COMMAND)
+    loop.offer(0.3, 1.0, "those in force")
+    result = loop.verify(setpoint_step=0.3)
+    assert result.why.code == Code.NOT_AT_REST, result.reason
+    assert "at its set-point: the measurement is 0.1 away from it" in result.reason
+    assert loop.set(command_max=5.0).successful
     assert loop.verify(setpoint_step=0.3).verdict == Verify.Result.PASSED
 
 
