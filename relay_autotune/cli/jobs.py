@@ -408,7 +408,7 @@ def add_details(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     taken.add_argument(
         "--clock", choices=CLOCKS, default=CLOCKS[0], metavar="TIME",
-        help="time of a message: publish, record, or header, the stamp in it (%(default)s)",
+        help="time of a message: publish, log or header, the stamp in it (%(default)s)",
     )  # fmt: skip
     taken.add_argument(
         "--join", action="store_true", help="take all BAGs as one recording on one timeline"
