@@ -385,18 +385,15 @@ def response(model: TransferFunction, time: ArrayLike, u: Input) -> FloatArray:
     """
     t = np.asarray(time, dtype=np.float64)
     flat = t.ravel()
-    if isinstance(u, PiecewiseConstant):
-        steps = np.diff(u.levels)
-    else:
+    if not isinstance(u, PiecewiseConstant):
         # A ramp is a step that is integrated once more.
-        steps = np.diff(u.slopes, prepend=0.0)
         model = replace(model, integrators=model.integrators + 1)
     changes = u.times + model.dead_time
     if changes.size == 0 or flat.size == 0:
         return np.zeros(t.shape)
     end = max(float(flat.max()), float(changes[-1]))
     modes = Modes.of(model, horizon=max(end - float(changes[0]), np.finfo(float).tiny))
-    states = modes.states(changes, steps)
+    states = modes.states(changes, u.steps)
     segment = np.searchsorted(changes, flat, side="right") - 1
     after = segment >= 0
     y = np.zeros(flat.shape)

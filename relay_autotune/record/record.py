@@ -260,6 +260,11 @@ class PiecewiseConstant:
         """The level before the first instant and from each on, shape (m + 1,)."""
         return np.append(self.initial, self.values)
 
+    @property
+    def steps(self) -> FloatArray:
+        """By how much it steps at each instant, shape (m,)."""
+        return np.diff(self.levels)
+
     def __call__(self, t: FloatArray) -> FloatArray:
         """Return the level in force at each time ``t`` [s], any shape."""
         return self.levels[np.searchsorted(self.times, t, side="right")]
@@ -298,6 +303,11 @@ class PiecewiseLinear:
     times: FloatArray
     slopes: FloatArray
     initial: float
+
+    @property
+    def steps(self) -> FloatArray:
+        """By how much its slope steps at each instant [1/s], shape (m,)."""
+        return np.diff(self.slopes, prepend=0.0)
 
     @classmethod
     def from_samples(cls, times: FloatArray, values: FloatArray) -> PiecewiseLinear:

@@ -46,6 +46,7 @@ from relay_autotune.identification.waveform.separable import (
 from relay_autotune.identification.waveform.starts import (
     ENDS,
     Guess,
+    best_fopdt,
     best_of,
     coarse,
     is_unobservable,
@@ -195,14 +196,14 @@ class FitContext:
         latest = latest_dead_times(problem, sign)
         few = problem.thinned(most) if most else problem
         rate = cache(lambda: likeliest_rate(problem))
-        return cls(few, _first_fopdt(few, sign), sign, held, bounded, latest, held, rate)
+        return cls(few, best_fopdt(few, sign), sign, held, bounded, latest, held, rate)
 
     def with_samples(self, problem: Problem) -> FitContext:
         """Return the context with other samples of the same record, of which nothing is fitted.
 
         :param problem: the samples, with a FOPDT structure.
         """
-        fopdt = _first_fopdt(problem, self.sign)
+        fopdt = best_fopdt(problem, self.sign)
         return replace(self, problem=problem, fopdt=fopdt, _fits={}, closest={}, _growing={})
 
     @cached_property
@@ -357,14 +358,12 @@ class FitContext:
         changed: dict[str, Any] = dict.fromkeys(terms, True)
         if "ends" in terms:
             changed["ends"] = self.ends
-            if self.ends is None:
-                return []
         if "rate" in terms:
             changed["rate"] = self.rate()
-            if self.rate() is None:
-                return []
         if "load" in terms:
             changed["load"] = likeliest_load(candidate.problem, candidate.state)
+        if None in changed.values():
+            return []
         problem, state = _with_terms_in_place(
             replace(candidate.problem, **changed), candidate.state
         )
@@ -536,7 +535,7 @@ class FitContext:
         :param sign: of the gain, 1 or -1.
         """
         problem = replace(without(self.problem, ["friction"]), structure=FOPDT, colour=None)
-        fopdt = _first_fopdt(problem, sign)
+        fopdt = best_fopdt(problem, sign)
         found = replace(self, problem=problem, fopdt=fopdt, _fits={}).fit(PLAIN)
         return [c for c in found if c.model.process_sign == sign]
 
@@ -603,11 +602,6 @@ class FitContext:
         nearer = min((evaluate(problem, theta) for theta in starts), key=lambda s: s.cost)
         again = refine(problem, nearer, tolerance=TRIAL)
         return again if state is None else min(state, again, key=lambda s: s.cost)
-
-
-def _first_fopdt(problem: Problem, sign: int) -> Trial:
-    """Return the best fit of a FOPDT, from which a context begins."""
-    return best_of(problem, start_fopdt(problem, sign))
 
 
 def _key_of_fit(problem: Problem) -> tuple[object, ...]:

@@ -36,7 +36,7 @@ from relay_autotune.identification.waveform.separable import (
     residual_of_model,
     rms_in_simulation,
 )
-from relay_autotune.identification.waveform.starts import Guess, best_of, start_fopdt
+from relay_autotune.identification.waveform.starts import Guess, best_fopdt, best_of
 from relay_autotune.process.structures import FOPDT, SOPDT, Structure
 from relay_autotune.process.transfer_function import TransferFunction
 from relay_autotune.process.ultimate import ultimate_point
@@ -164,7 +164,7 @@ def _large_moves(fit: Fit) -> list[TransferFunction]:
     if fit.problem.rate is None:
         return []
     first = without(replace(fit.problem, structure=FOPDT), ["rate"])
-    guess = Guess.of(first, best_of(first, start_fopdt(first)))
+    guess = Guess.of(first, best_fopdt(first))
     found = best_of(replace(first, structure=SOPDT), guess.starts(SOPDT))
     model = SOPDT.model_at(found.theta, fit.scale * found.coefficients)
     return [] if model is None else [model]

@@ -441,16 +441,8 @@ class Problem:
 
     def each(self) -> list[Problem]:
         """Return the problem of each experiment, with the terms that are estimated beside all."""
-        return [
-            replace(
-                self.part(part),
-                inputs=self.inputs[i : i + 1],
-                bounds=(0,),
-                motions=self.motions[i : i + 1],
-                load=None if i else self.load,
-            )
-            for i, part in enumerate(self.experiments)
-        ]
+        parts = zip(self.experiments, self.inputs, strict=True)
+        return [replace(self.part(part), inputs=(u,), bounds=(0,)) for part, u in parts]
 
     def thinned(self, most: int, *, scattered: bool = False) -> Problem:
         """Return the problem of evenly spaced samples.

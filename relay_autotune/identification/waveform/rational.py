@@ -53,8 +53,7 @@ class Inputs:
         heights = np.zeros((len(self.each), at.size))
         for row, u in zip(heights, self.each, strict=True):
             # A ramp is a step that is integrated once more.
-            levels = u.levels if isinstance(u, PiecewiseConstant) else np.append(0.0, u.slopes)
-            row[at.searchsorted(u.times)] = np.diff(levels)
+            row[at.searchsorted(u.times)] = u.steps
         return at, heights
 
 

@@ -243,6 +243,15 @@ def start_fopdt(problem: Problem, sign: int = 0) -> list[FloatArray]:
     return _best_of_grid(problem, logs, dead_times, latest_dead_times(problem, sign))
 
 
+def best_fopdt(problem: Problem, sign: int = 0) -> Trial:
+    """Return the best fit of a FOPDT.
+
+    :param problem: with a FOPDT structure.
+    :param sign: of the gain, 1 or -1; 0: not known.
+    """
+    return best_of(problem, start_fopdt(problem, sign))
+
+
 def start_unstable(problem: Problem) -> list[FloatArray]:
     """Return the best few of a grid of lags and D for a process that grows by itself.
 
@@ -403,8 +412,7 @@ def likeliest_rate(problem: Problem) -> float | None:
     rates = float(np.ptp(problem.levels)) / np.geomspace(shortest, _LONGER * longest, _RATES)
     fits: list[Trial] = []
     for rate in rates:
-        at = replace(few, rate=rate)
-        fits.append(best_of(at, start_fopdt(at)))
+        fits.append(best_fopdt(replace(few, rate=rate)))
         if fits[-1].cost > _TOO_SLOW * min(fit.cost for fit in fits):
             break
     k = min(range(len(fits)), key=lambda i: fits[i].cost)
